@@ -109,8 +109,10 @@ lint: setup
 LAB := $(or $(THESIS_REPRO_BUILD),build)/lab
 lab: setup
 	@mkdir -p "$(LAB)" && cd notebooks && for path in *.ipynb thesis; do test -e "$(abspath $(LAB))/$$path" || cp -r $$path "$(abspath $(LAB))"; done
-	@echo "the notebooks are copies in $(LAB); delete one to get it anew"
+	@echo "the notebooks are copies in $(LAB); delete one to get it anew. One that was idle for an hour loses its memory:"
+	@echo "run its cells again. Open the address below:"
 	@THESIS_REPRO_PROFILE=$(or $(THESIS_REPRO_PROFILE),lab) PYTHONPATH="$(CURDIR)" $(BIN)/jupyter lab "$(LAB)" --log-level=ERROR \
+	  --MappingKernelManager.cull_idle_timeout=3600 --MappingKernelManager.cull_connected=True \
 	  $(if $(LISTEN),--ip=$(LISTEN) --no-browser) $(if $(filter 0,$(shell id -u)),--allow-root)
 bench: setup
 	@$(if $(KITTI),,$(BIN)/python -m thesis_repro synthesize build/world-demo)

@@ -231,11 +231,12 @@ def _pictures(
 def _write_missing(missing: list[Picture], jobs: int) -> None:
     """Render and write pictures in several processes."""
     workers = min(effective_n_jobs(jobs), 1 + len(missing) // 40)
-    with progress(
-        description="rendering the embedded world", total=len(missing), unit="picture"
-    ) as bar:
+    first = "starting the renderer (its first use compiles it, up to a minute)"
+    with progress(description=first, total=len(missing), unit="picture") as bar:
+        bar.refresh()  # shown before the first picture is done
         # compiles the rasteriser once, for all worker processes
         bar.update(_write_pictures(missing[:1]))
+        bar.set_description("rendering the embedded world", refresh=False)
         parallel = Parallel(
             n_jobs=workers,
             return_as="generator_unordered",

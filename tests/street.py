@@ -57,6 +57,9 @@ class Street:
     def frame(self, index):
         return self.images[index]
 
+    def visible(self, index):
+        return None
+
 
 class Stripes:
     """Masks that keep vertical stripes of a width in pixels, 5 pixels further with every frame."""

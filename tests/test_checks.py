@@ -58,6 +58,16 @@ def test_sequences_without_ground_truth_need_no_poses(tiny_kitti):
     assert [line.split("poses/")[1][:6] for line in problems] == ["00.txt", "11.txt"]
 
 
+def test_frames_that_equal_the_one_before_are_counted(tiny_kitti, capsys):
+    images = tiny_kitti / IMAGES
+    assert checks.check_kitti(tiny_kitti) == []
+    assert "equal" not in capsys.readouterr().out
+    for index in (2, 3):
+        shutil.copy(images / "000001.png", images / f"{index:06d}.png")
+    assert checks.check_kitti(tiny_kitti) == []
+    assert "2 frames equal the frame before" in capsys.readouterr().out
+
+
 def test_unchanged_data_is_checked_once(tiny_kitti, tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("THESIS_REPRO_KITTI", str(tiny_kitti))
     for frame, reports in ((None, True), (None, False), (0, True)):
@@ -66,6 +76,34 @@ def test_unchanged_data_is_checked_once(tiny_kitti, tmp_path, monkeypatch, capsy
             shutil.copy(images / "000001.png", images / f"{frame:06d}.png")
         assert checks.main(tmp_path / "checked") == 0
         assert (str(tiny_kitti) in capsys.readouterr().out) == reports
+
+
+@pytest.mark.parametrize(
+    "times, speed, scale, said",
+    [
+        ([0, 0.1, 0.2, 0.3], None, 1, []),
+        ([0, 0.1, 0.2, 0.3], None, 9, []),  # 90 m/s
+        ([0, 0.1, 0.2, 0.3], None, 100, ["3 of 3 steps"]),  # centimetres
+        (None, None, 40, []),  # a frame a second
+        (None, None, 1000, ["3 of 3 steps"]),  # millimetres
+        ([0, 1e8, 2e8, 3e8], 8, 1, ["8e+08 m in 1e+08 s"]),  # nanoseconds
+        ([0, 0.1, 0.2, 60], 8, 1, ["1 of 3 steps", "before 000003.png"]),
+        ([0, 0.1, 0.2, 60], None, 1, ["before 000003.png"]),
+        ([0, 0.1, 0.2, 0.9], None, 1, []),
+    ],
+)
+def test_steps_that_nothing_drives_are_named(tiny_kitti, times, speed, scale, said):
+    if times:
+        (tiny_kitti / "sequences/00/times.txt").write_text("".join(f"{t}\n" for t in times))
+    else:
+        (tiny_kitti / "sequences/00/times.txt").unlink()
+    poses = tiny_kitti / "poses/00.txt"
+    poses.write_text("".join(f"1 0 0 0 0 1 0 0 0 0 1 {scale * index}\n" for index in range(4)))
+    if speed:
+        poses.unlink()
+    lines = checks.of_sequence(Sequence(tiny_kitti, "00", speed=speed))
+    assert len(lines) == len(said)
+    assert all(text in line for text, line in zip(said, lines))
 
 
 def test_a_centre_far_from_the_middle_and_steps_that_were_left_out(tiny_kitti):
@@ -90,7 +128,8 @@ HALF = np.repeat([[0, 255]], 48, axis=0).repeat(32, axis=1).astype(np.uint8)
         ("labels", TRAIN, {}, "--ids train"),
         ("labels", TRAIN, {"ids": "train"}, None),
         ("labels", STREET + 11, {}, "KITTI-360"),
-        ("labels", 0 * STREET + 23, {}, "0.0%"),
+        ("labels", 0 * STREET + 23, {}, "nothing but sky"),
+        ("labels", 0 * STREET, {"ids": "train"}, "nothing but road"),
         ("masks", HALF, {}, None),
         ("masks", 0 * HALF, {}, "--invert"),
         ("masks", HALF | 255, {}, "100.0%"),

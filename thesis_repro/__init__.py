@@ -5,10 +5,34 @@ build_unet and InputError. Names are imported on first use, so TensorFlow is loa
 build_unet.
 """
 
-from importlib import import_module, metadata
+from importlib import metadata
 from typing import TYPE_CHECKING, Any
 
 from thesis_repro.errors import InputError, missing_package
+
+if TYPE_CHECKING:
+    __version__: str
+    from thesis_repro._face import (
+        THESIS,
+        LabelMasks,
+        Masks,
+        MaskSettings,
+        Matches,
+        Odometry,
+        OdometrySettings,
+        Result,
+        Sequence,
+        Step,
+        filled,
+        filtered,
+        keypoint_mask,
+        orb,
+        refined,
+        run,
+        run_many,
+        spread,
+    )
+    from thesis_repro.segmentation.unet import build_unet
 
 __all__ = [
     "THESIS",
@@ -23,52 +47,35 @@ __all__ = [
     "Sequence",
     "Step",
     "build_unet",
+    "filled",
+    "filtered",
     "keypoint_mask",
+    "orb",
+    "refined",
     "run",
     "run_many",
+    "spread",
 ]
 
-if TYPE_CHECKING:
-    __version__: str
-    from thesis_repro.data.kitti import Sequence
-    from thesis_repro.mask_files import LabelMasks
-    from thesis_repro.masks import MaskSettings, keypoint_mask
-    from thesis_repro.odometry import THESIS, Odometry, OdometrySettings, run, run_many
-    from thesis_repro.odometry.runs import Masks, Result
-    from thesis_repro.odometry.types import Matches, Step
-    from thesis_repro.segmentation.unet import build_unet
-else:
-    _HOMES = {
-        "Sequence": "data.kitti",
-        "keypoint_mask": "masks",
-        "LabelMasks": "mask_files",
-        "MaskSettings": "masks",
-        "Masks": "odometry.runs",
-        "Result": "odometry.runs",
-        "run": "odometry.runs",
-        "run_many": "odometry.runs",
-        "Matches": "odometry.types",
-        "Step": "odometry.types",
-        "Odometry": "odometry",
-        "OdometrySettings": "odometry",
-        "THESIS": "odometry",
-        "build_unet": "segmentation.unet",
-    }
 
-    def __getattr__(name: str) -> Any:
-        if name == "__version__":
-            return metadata.version("thesis-repro")
-        if name not in _HOMES:
-            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        try:
-            home = import_module(f"{__name__}.{_HOMES[name]}")
-        except ImportError as error:
-            missing = missing_package(error)
-            if missing is None:
-                raise
-            # not an ImportError, so that help() and hasattr() work without TensorFlow
-            raise AttributeError(f"{name}: {missing}") from None
-        return getattr(home, name)
+def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        return metadata.version("thesis-repro")
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    try:
+        if name == "build_unet":
+            from thesis_repro.segmentation.unet import build_unet
+
+            return build_unet
+        from thesis_repro import _face
+    except ImportError as error:
+        missing = missing_package(error)
+        if missing is None:
+            raise
+        # not an ImportError, so that help() and hasattr() work without TensorFlow
+        raise AttributeError(f"{name}: {missing}") from None
+    return getattr(_face, name)
 
 
 def __dir__() -> list[str]:

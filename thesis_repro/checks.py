@@ -5,6 +5,7 @@ can only be guessed is not checked: the figures of a study show frames, masks an
 """
 
 import sys
+import zlib
 from collections.abc import Callable, Collection, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -24,6 +25,9 @@ from thesis_repro.running.settings import read_settings
 # Of the principal point from the middle, in frame widths and heights. KITTI has at most 0.04.
 # Frames are cropped at their upper or lower edge more often than at their sides.
 MAX_CENTRE_OFFSET = 0.075, 0.15
+# What drives stays below them; KITTI's car reaches 2.8 m a frame and 26 m/s.
+MAX_STEP, MAX_SPEED = 50.0, 100.0  # metres a frame, metres a second
+MAX_GAP = 10  # intervals between frames
 MASK_SAMPLES = 6  # frames whose masks are looked at
 MIN_SHARE = 0.005  # of the frames: that masks keep, and of a class that is named
 MAX_DROPPED = 0.1  # share of a run's steps
@@ -69,7 +73,15 @@ def check_kitti(root: Path) -> list[str]:
             f"{sequence.has_truth}; with times: {sequence.has_times}"
         )
         print("\n".join(f"  {one_line(line)}" for line in [fact, *of_sequence(sequence)]))
-        problems += _damaged(sequence.frame, range(len(sequence)), f"sequence {name}")
+        checksums: dict[int, int] = {}
+
+        def read(index: int, sequence: Any = sequence, checksums: Any = checksums) -> None:
+            checksums[index] = zlib.crc32(sequence.frame(index).data)
+
+        problems += _damaged(read, range(len(sequence)), f"sequence {name}")
+        equal = sum(checksums[index] == checksums.get(index - 1) for index in checksums)
+        if equal:
+            print(f"  sequence {name}: {equal} frames equal the frame before, and are no steps")
     return sorted(problems)
 
 
@@ -147,16 +159,46 @@ def main(path: Path) -> int:
 
 
 def of_sequence(sequence: kitti.Sequence) -> list[str]:
-    """Warn of a camera whose principal point is far from the middle of the frames."""
+    """Warn of a principal point far from the middle of the frames, and of impossible steps."""
     height, width = sequence.size
     u, v = sequence.intrinsics[:2, 2]
     across, down = MAX_CENTRE_OFFSET
-    if abs(u / width - 0.5) <= across and abs(v / height - 0.5) <= down:
-        return []
-    return [
-        f"sequence {sequence.name}: {sequence.calibration_path.name} has the centre {u:g}, {v:g}, far "
-        f"from the middle of frames of {width}x{height} pixels; it must belong to frames of this size"
-    ]
+    warnings = []
+    if abs(u / width - 0.5) > across or abs(v / height - 0.5) > down:
+        warnings.append(
+            f"sequence {sequence.name}: {sequence.calibration_path.name} has the centre {u:g}, {v:g}, far "
+            f"from the middle of frames of {width}x{height} pixels; it must belong to frames of this size"
+        )
+    return warnings + _of_steps(sequence)
+
+
+def _of_steps(sequence: kitti.Sequence) -> list[str]:
+    """Warn of steps longer or faster than what drives, and of gaps in the times."""
+    intervals = np.diff(sequence.times)
+    lengths, unit = sequence.assumed_steps[1:], "times in seconds, and the speed in metres a second"
+    if sequence.has_truth:
+        lengths = np.linalg.norm(np.diff(sequence.poses[:, :3, 3], axis=0), axis=1)
+        unit = "true positions in metres, and times in seconds"
+    impossible = lengths > MAX_STEP
+    if sequence.has_times:
+        impossible |= lengths > MAX_SPEED * intervals
+    gaps = intervals > MAX_GAP * (np.median(intervals) if len(intervals) else 0)
+    warnings = []
+    if impossible.any():
+        first = impossible.argmax()
+        warnings.append(
+            f"sequence {sequence.name}: {impossible.sum()} of {len(lengths)} steps are impossible; the "
+            f"first is {lengths[first]:.3g} m in {intervals[first]:.3g} s, to "
+            f"{sequence.frame_paths[first + 1].name}; are {unit}?"
+        )
+    if gaps.any():
+        first = gaps.argmax()
+        warnings.append(
+            f"sequence {sequence.name}: the times have {gaps.sum()} gaps; the first is "
+            f"{intervals[first]:.3g} s, before {sequence.frame_paths[first + 1].name}; the odometry cannot "
+            "bridge them, so run the parts on their own"
+        )
+    return warnings
 
 
 def of_run(
@@ -188,8 +230,15 @@ def of_masks(source: LabelMasks | MaskFolder) -> list[str]:
     """
     folder = source.paths[0].parent
     shares = [coverage(source[index]) for index in _sampled(source)]
-    if isinstance(source, LabelMasks) and source.settings.ids == "labels":
+    ids = np.arange(cityscapes.N_CLASSES)
+    if isinstance(source, LabelMasks):
         ids = np.flatnonzero(_class_shares(source))
+    if len(ids) == 1:
+        return [
+            f"{folder}: label maps hold nothing but {cityscapes.LABELS[ids[0]].name}; the network that "
+            "made them does not work, or has other ids"
+        ]
+    if isinstance(source, LabelMasks) and source.settings.ids == "labels":
         if ids.max() < len(cityscapes.TRAINED):
             return [
                 f"{folder}: label maps hold no id above {ids.max()}, so no sky, vegetation or cars; "

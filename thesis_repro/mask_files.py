@@ -4,6 +4,7 @@ import os
 from dataclasses import asdict
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -11,14 +12,7 @@ import numpy as np
 from thesis_repro.data import label_ids
 from thesis_repro.data.kitti import Sequence, check_size
 from thesis_repro.errors import InputError
-from thesis_repro.masks import (
-    THESIS_MASKS,
-    MaskSettings,
-    check_width,
-    edges,
-    finished,
-    forbidden,
-)
+from thesis_repro.masks import THESIS_MASKS, MaskSettings, check, forget, keypoint_mask
 from thesis_repro.running import results
 from thesis_repro.running.files import listed, progress, read_gray, write_png
 
@@ -30,7 +24,7 @@ class LabelMasks:
     """Masks of a sequence, made from label maps on access: masks[i] for frame i.
 
     folder: holds one label map a frame, of any size, as a PNG with the frame's name, or a folder of
-    them for each sequence. settings: as in `keypoint_mask`.
+    them for each sequence. dilation_width, settings: as in `keypoint_mask`.
     Raises InputError if the folder or a frame's label map is missing.
     """
 
@@ -38,7 +32,7 @@ class LabelMasks:
         self,
         folder: str | Path,
         sequence: Sequence,
-        dilation_width: int,
+        dilation_width: int | None,
         settings: MaskSettings = THESIS_MASKS,
     ) -> None:
         self.paths = _paths_by_frame(folder, sequence, "label map")
@@ -46,16 +40,23 @@ class LabelMasks:
         self.size = sequence.size
         self.dilation_width = dilation_width
         self.settings = settings
-        check_width(dilation_width, self.size)
+        check(dilation_width, self.size, settings)
 
     def __len__(self) -> int:
         return len(self.paths)
 
     def __getitem__(self, index: int) -> np.ndarray:
-        edge_image, forbidden_pixels = _undilated(
-            _version(self.paths[index]), self.size, self.settings
-        )
-        return finished(edge_image, forbidden_pixels, self.dilation_width, self.settings)
+        path = self.paths[index]
+        status = os.stat(path)
+        label_map = _read_once(path, self.settings.ids, status.st_mtime_ns, status.st_size)
+        return keypoint_mask(label_map, self.size, self.dilation_width, self.settings)
+
+    def check_files(self, known: set[Any]) -> None:
+        """Raise InputError if a label map cannot be read. known: files that can, added to."""
+        ids = self.settings.ids
+        for path in [path for path in self.paths if (path, ids) not in known]:
+            label_ids.read(path, ids)
+            known.add((path, ids))
 
 
 def label_map_of(masks: LabelMasks, index: int) -> np.ndarray:
@@ -63,32 +64,15 @@ def label_map_of(masks: LabelMasks, index: int) -> np.ndarray:
     return label_ids.read(masks.paths[index], masks.settings.ids)
 
 
-# Masks of several widths share edges, and masks of several settings share label maps. A control
-# takes the label map of another frame. So the last few are kept, until a file changes.
-
-
-def _version(path: Path) -> tuple[Path, int, int]:
-    status = os.stat(path)
-    return path, status.st_mtime_ns, status.st_size
-
-
-@lru_cache(maxsize=8)
-def _undilated(
-    version: tuple[Path, int, int], size: tuple[int, int], settings: MaskSettings
-) -> tuple[np.ndarray, np.ndarray | None]:
-    """The edges and the forbidden pixels of a label map's file."""
-    label_map = _read_once(version, settings.ids)
-    return edges(label_map, size, settings), forbidden(label_map, size, settings)
-
-
-@lru_cache(maxsize=2)
-def _read_once(version: tuple[Path, int, int], ids: str) -> np.ndarray:
-    return label_ids.read(version[0], ids)
+@lru_cache(maxsize=2)  # masks of several settings, and controls, share label maps
+def _read_once(path: Path, ids: str, changed: int, size: int) -> np.ndarray:
+    """Read a label map. changed, size: of its file, which may be written anew."""
+    return label_ids.read(path, ids)
 
 
 def forget_edges() -> None:
     """Clear what LabelMasks keeps, so that the time to make a mask can be measured."""
-    _undilated.cache_clear()
+    forget()
     _read_once.cache_clear()
 
 
@@ -137,6 +121,12 @@ class MaskFolder:
         if self.invert:
             return cv2.bitwise_not(mask)
         return mask
+
+    def check_files(self, known: set[Any]) -> None:
+        """Raise InputError if a mask cannot be read. known: files that can, added to."""
+        for path in [path for path in self.paths if path not in known]:
+            read_mask(path, self.size)
+            known.add(path)
 
 
 def read_mask(path: str | Path, size: tuple[int, int] | None = None) -> np.ndarray:

@@ -28,6 +28,7 @@ from thesis_repro import mask_files, masks, odometry
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.odometry import THESIS, Odometry
 from thesis_repro.odometry import odometry as page
+from thesis_repro.odometry.estimators import refined
 from thesis_repro.running import messages
 from thesis_repro.running.files import write_text
 from thesis_repro.running.settings import ROOT
@@ -68,8 +69,7 @@ def step_cost(sequence):
     They are medians of the best of 3.
     """
     followers = [
-        Odometry(sequence.intrinsics, replace(THESIS, estimator=name))
-        for name in ("thesis", "refined")
+        Odometry(sequence.intrinsics, replace(THESIS, estimator=make)) for make in (None, refined)
     ]
     metres, costs = odometry.scales(sequence), []
     clock = time.thread_time  # does not count other processes
@@ -123,7 +123,7 @@ def mask_cost(sequence, labels):
     """
     source, costs = Source(labels), np.zeros(2)
     kinds = [source.masks(sequence, width) for width in WIDTHS] + [
-        methods.masks_of_method(method, source, sequence, methods.LINE_WIDTH)
+        methods.METHODS[method].choose(sequence, source, methods.LINE_WIDTH)[1]
         for method in methods.MASK_CONTROLS
         if method != "true-labels"
     ]
@@ -158,9 +158,9 @@ def compile_cost():
 def measure(sequence):
     """Return a table with a row for each measurement, its reference and their ratio."""
     # loads compiled code
-    odometry.run_many(sequence.subset(2), {"": (replace(THESIS, estimator="refined"), None)})
+    odometry.run_many(sequence.subset(2), {"": (replace(THESIS, estimator=refined), None)})
     cv2.setNumThreads(1)  # one thread makes times comparable
-    step, refined, bare = step_cost(sequence)
+    step, refined_step, bare = step_cost(sequence)
     together, alone, same = shared_cost(sequence.subset(12))
     with tempfile.TemporaryDirectory() as labels:
         prediction.write_label_maps(prediction.load_shipped(), sequence.frame_paths, labels)
@@ -170,7 +170,7 @@ def measure(sequence):
     table = pd.DataFrame(
         [
             ("a step of the odometry", "ms", step, "its bare OpenCV calls", bare),
-            ("a refined step", "ms", refined, "a step", step),
+            ("a refined step", "ms", refined_step, "a step", step),
             (in_one_pass, "ms a frame", together, "one by one", alone),
             (
                 "masks and controls made together",

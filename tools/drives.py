@@ -20,7 +20,7 @@ def main() -> None:
         only="kitti",
         replace=not settings.cityscapes_is_embedded,
     )
-    refined = tr.OdometrySettings(estimator="refined")
+    refined = tr.OdometrySettings(estimator=tr.refined)
     tr.run_many(tr.Sequence(settings.kitti, "00").subset(3), {"": (refined, None)})
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+import choices
 import failures
 import label_quality
 from thesis import few_keypoints
@@ -21,11 +22,12 @@ from thesis_repro.data import kitti
 from thesis_repro.errors import InputError
 from thesis_repro.odometry import metrics
 from thesis_repro.report import style, texts
+from thesis_repro.report import worth as report_worth
 from thesis_repro.running import messages, results
 from thesis_repro.running.files import needed, write_text
 from thesis_repro.running.settings import ROOT, read_settings
-from thesis_repro.study import jobs, runner
-from thesis_repro.study.sources import named
+from thesis_repro.study import jobs, runner, worth
+from thesis_repro.study.sources import Source, named
 
 FOLDER = ROOT / "figures" / "kitti_excerpts"
 # Figures and tables of notebooks 8 and 9. Other notebooks draw frames, which are not ours to give.
@@ -41,7 +43,7 @@ RUNS = ("runs", "shuffled_runs", "ablations")  # tables of runs in the build fol
 # What the sequences show at their start: 00 to 10 are KITTI odometry's, the others raw drives.
 STREETS = {
     "00": "a residential street with parked cars",
-    "01": "a slip road onto a motorway",
+    "01": "a ramp onto a motorway",
     "02": "a main road, then a turn into a road between trees",
     "05": "a residential street with few parked cars",
     "06": "a straight street past a building site, with parked cars",
@@ -79,6 +81,14 @@ def write(settings, folder, others=()):
     few_runs = few_keypoints.measure(sequences, labels, few_folder, settings.jobs)
     few = few_keypoints.table(few_runs)
     times = few_keypoints.time_steps(sequences[0], labels, few_folder)
+    worths = worth.measure(
+        sequences,
+        [Source(labels)],
+        jobs.CONTROL_WIDTH,
+        settings.build / "worth",
+        (worth.DECIDING, 0, 200, 100),
+        settings.jobs,
+    )
     streets = _streets(sequences)
     results.sweep(folder)
     for name in KEPT:
@@ -88,17 +98,23 @@ def write(settings, folder, others=()):
             "failures": failures.figure(steps, sequences, label_masks),
             "few_keypoints": few_keypoints.figure(few, times),
             "label_quality": label_quality.figure(qualities),
+            "worth": report_worth.figure(worths),
         },
         {
             "failures": failures.table(steps),
             "streets": streets,
             "label_quality": qualities,
             "few_keypoints": few_keypoints.summary(few, times),
+            "worth": report_worth.table(worths),
+            "choices": choices.table(runs, few_runs, worths),
         },
         folder,
         note,
     )
-    tables = {name: _read(settings, name) for name in RUNS} | {"few_keypoints_runs": few_runs}
+    tables = {name: _read(settings, name) for name in RUNS} | {
+        "few_keypoints_runs": few_runs,
+        "worth_runs": worths,
+    }
     for name, rows in tables.items():
         # six digits are enough: shuffling the matched points changes more
         text = rows.to_csv(index=False, lineterminator="\n", float_format="%.6g")
@@ -160,16 +176,21 @@ def _other_runs(settings, sequences, others):
 
 
 def _streets(sequences):
-    """Return what each sequence shows, its length (metres) and the sum of its turns (degrees)."""
+    """Return what each sequence shows, its length (metres) and the sum of its turns (degrees).
+
+    A turn is the yaw of a step, its rotation about the camera's axis down. Pitch and roll, which a
+    road's unevenness gives, are no turns.
+    """
     rows = []
     for sequence in sequences:
         steps = np.linalg.inv(sequence.poses[:-1]) @ sequence.poses[1:]
+        yaw = np.degrees(np.arctan2(steps[:, 0, 2], steps[:, 2, 2]))
         rows.append(
             {
                 "sequence": sequence.name,
                 "frames": len(sequence),
                 "metres": round(metrics.travelled(sequence.poses)[-1]),
-                "turns (degrees)": round(metrics.angles(steps[:, :3, :3]).sum()),
+                "turns (degrees)": round(np.abs(yaw).sum()),
                 "street": STREETS.get(sequence.name, ""),
             }
         )

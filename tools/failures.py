@@ -11,10 +11,11 @@ import numpy as np
 import pandas as pd
 
 from thesis_repro.odometry import THESIS, Matches, Odometry, metrics, scales
+from thesis_repro.odometry.estimators import refined
 from thesis_repro.odometry.refined.fit import SUPPORT_THRESHOLDS, near, with_uncertainty
 from thesis_repro.report import style
 
-SETTINGS = replace(THESIS, estimator="refined")
+SETTINGS = replace(THESIS, estimator=refined)
 KINDS = {"all": ("all keypoints", style.BASELINE), "masks": ("masks", style.MASKED)}
 CELLS = 4  # columns and rows into which a frame is divided
 # degrees between the rotation errors of a step with masks and with all keypoints

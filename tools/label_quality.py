@@ -109,35 +109,40 @@ def _of_embedded_world():
 
 
 def figure(table):
-    """Draw the ratios to all keypoints over the mean IoU, one panel a judging metric.
+    """Draw the ratios to all keypoints, one row a source of label maps, one panel a judging metric.
 
+    The mean IoU is a text beside the row and no axis, because each was measured on other images.
     table: from `table`.
     """
-    rows = table[(table["over"] == ALL_KEYPOINTS) & table["mean IoU"].notna()]
+    rows = table[table["over"] == ALL_KEYPOINTS]
+    names = [_label(row) for _, row in rows.iterrows()]
     labels = list(compare.JUDGING_METRICS.values())
-    drawing, panels = style.new_figure(1, len(labels), height=3.6, squeeze=False)
+    drawing, panels = style.new_figure(
+        1, len(labels), height=0.9 + 0.42 * len(rows), squeeze=False, sharey=True
+    )
     for panel, label in zip(panels[0], labels):
-        numbers = rows[label].str.extract(RATIO).astype(float)
-        for number, (index, row) in enumerate(rows.iterrows()):
-            ratio, low, high = numbers.loc[index]
-            color = style.line_style(number)["color"]
-            marker, filling = "s", "white"
-            if row["odometry"] == REAL:
-                marker, filling = "o", color
-            x = row["mean IoU"]
-            panel.plot([x, x], [low, high], **style.interval_style(color, "_"))
-            panel.plot(
-                x,
-                ratio,
-                marker,
-                color=color,
-                markersize=4,
-                markerfacecolor=filling,
-                label=f"{row['label maps']}; {row['odometry']}: {row['sequences']}",
-            )
-        panel.axhline(1, color="black", linewidth=0.8)
-        panel.set(title=label, xlabel="mean IoU of the label maps", xlim=(0.25, 1.05))
-        style.ratio_axis(panel.yaxis, [1, *numbers.to_numpy().ravel()])
-    panels[0, 0].set_ylabel("ratio to all keypoints\n(below 1: lower)")
-    style.legend_below(drawing, list(panels[0]), 1)
+        numbers = rows[label].str.extract(RATIO).astype(float).to_numpy()
+        for place, (ratio, low, high) in enumerate(numbers):
+            color = style.BLUE
+            filling = color if rows["odometry"].iloc[place] == REAL else "white"
+            panel.plot([low, high], [place, place], **style.interval_style(color, "|"))
+            panel.plot(ratio, place, "o", color=color, markersize=5, markerfacecolor=filling)
+        panel.axvline(1, color="black", linewidth=0.8)
+        panel.set(title=label, xlabel="ratio to all keypoints")
+        panel.grid(axis="y", visible=False)
+        style.ratio_axis(panel.xaxis, [1, *numbers.ravel()])
+    panels[0, 0].set_yticks(range(len(rows)), names, fontsize=7)
+    panels[0, 0].set_ylim(len(rows) - 0.5, -0.5)
     return drawing
+
+
+def _label(row):
+    """Return what stands beside a row: the source, its mean IoU and where, and the sequences."""
+    sequences = row["sequences"]
+    if row["odometry"] == REAL:
+        sequences = f"{1 + sequences.count(',')} streets"
+    quality = "not known"
+    if pd.notna(row["mean IoU"]):
+        where = row["mean IoU from"].partition(",")[0]
+        quality = f"{row['mean IoU']:.2f}, {where if where == 'exact' else f'on {where}'}"
+    return f"{row['label maps']}, {sequences}\nmean IoU {quality}"

@@ -17,10 +17,11 @@ import pandas as pd
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.mask_files import MaskFolder
 from thesis_repro.odometry import THESIS, Odometry, run_many, scales
+from thesis_repro.odometry.estimators import refined
 from thesis_repro.odometry.odometry import normalise
 
 FOLDER = Path(__file__).parent.parent / "tests" / "reference"
-ESTIMATORS = {"thesis": THESIS, "refined": replace(THESIS, estimator="refined")}
+ESTIMATORS = {"thesis": THESIS, "refined": replace(THESIS, estimator=refined)}
 # {run: (its sequence, its first and its last recorded step, its keypoints in place of 2000)};
 # step n ends in frame n
 STEPS = {
@@ -88,7 +89,7 @@ def steps(sequence, masks, first, last, count=2000):
         row = estimated(*points, sequence.intrinsics)
         step = follower.step(frames[1], scales(sequence)[index], masks[index])
         np.testing.assert_array_equal(step.current, row["current"])
-        refined = {
+        motion = {
             "frames": index,
             "scales": step.scale,
             "true_motions": np.linalg.inv(sequence.poses[index - 1]) @ sequence.poses[index],
@@ -97,7 +98,7 @@ def steps(sequence, masks, first, last, count=2000):
             "refined_translations": step.motion.translation,
             "flags": step.motion.flag,
         }
-        rows.append(row | refined)
+        rows.append(row | motion)
     return rows
 
 

@@ -21,7 +21,7 @@ import tensorflow as tf
 
 from thesis_repro.data import cityscapes, kitti
 from thesis_repro.running import files, messages, results
-from thesis_repro.running.settings import ROOT, read_settings
+from thesis_repro.running.settings import ALL_WIDTHS, ROOT, read_settings
 from thesis_repro.segmentation import prediction, quality, training
 from thesis_repro.segmentation.unet import build_unet
 from thesis_repro.study import compare, jobs, runner, workers
@@ -107,7 +107,7 @@ def run(settings, sources):
     folder = settings.build / "trainings/odometry"
     first = jobs.first_jobs(
         sequences,
-        {"thesis": settings.sizes.widths, DECIDING: []},
+        {"thesis": ALL_WIDTHS, DECIDING: []},
         tested=jobs.CONTROL_WIDTH,
         sources=sources,
         repetitions=repetitions,

@@ -15,19 +15,17 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from thesis_repro import masks, odometry
+from thesis_repro import masks
 from thesis_repro.data.cityscapes import ID, read_label_map, resize_bilinear
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.mask_files import LabelMasks
 from thesis_repro.masks import MaskSettings
-from thesis_repro.odometry import THESIS, OdometrySettings, estimators, metrics
+from thesis_repro.odometry import THESIS, OdometrySettings, estimators, keypoints, metrics
 from thesis_repro.odometry.odometry import detect, normalise, track
 from thesis_repro.odometry.runs import Masks
 from thesis_repro.running import results
-from thesis_repro.running.files import progress, write_text
-from thesis_repro.study import workers
-from thesis_repro.study.jobs import CONTROL_WIDTH
-from thesis_repro.study.runner import CODE, measures
+from thesis_repro.study.jobs import CONTROL_WIDTH, Job
+from thesis_repro.study.runner import Run, run_all, run_poses
 
 ESTIMATORS = tuple(estimators.ESTIMATORS)
 VEGETATION = (ID["vegetation"], ID["terrain"])
@@ -135,60 +133,43 @@ def measure(
     Columns: sequence, method, estimator, repetition, those of `runner.measures`, and sim3 (RMSE in
     metres after an alignment with scale).
     """
-    calls = [
-        (sequence, labels / sequence.name, folder / sequence.name, repetitions, dilation_width)
-        for sequence in sequences
-    ]
-    with workers.open_pool(processes) as pool:
-        tables = list(progress(pool.run(_measure, calls), "ablations", len(calls), "sequence"))
-    return pd.concat(tables, ignore_index=True)
-
-
-def _measure(
-    sequence: Sequence, labels: Path, folder: Path, repetitions: int, dilation_width: int
-) -> pd.DataFrame:
-    results.stage(
-        folder,
-        options={"repetitions": repetitions, "dilation_width": dilation_width},
-        code=results.digest_of_code(*CODE),
-        ablations=results.digest_of_file(__file__),
-        **results.made_with("opencv", "numpy", "numba"),
-        sequence=results.digest_of_files(sequence.files),
-        labels=results.digest_of_files([labels / path.name for path in sequence.frame_paths]),
-        model=results.made_from(labels),
-    )
-    path = folder / "runs.csv"
-    if not path.is_file():
-        cv2.setNumThreads(1)  # the processes already use every core
-        runs = runs_of(sequence, labels, repetitions, dilation_width)
-        by_name = {" ".join(map(str, key)): run for key, run in runs.items()}
-        rows = []
-        for key, result in zip(runs, odometry.run_many(sequence, by_name).values(), strict=True):
-            row: dict[str, Any] = dict(zip(("method", "estimator", "repetition"), key, strict=True))
-            row |= measures(result.frames, sequence.poses)
-            row["sim3"] = metrics.ate(result.poses, sequence.poses, "sim3")
-            rows.append({**row, "sequence": sequence.name})
-        write_text(path, pd.DataFrame(rows).to_csv(index=False))
-    return pd.read_csv(path, dtype={"sequence": str})
+    opened = list(sequences)
+    runs: dict[Job, Run] = {}
+    made_from = {}
+    for sequence in opened:
+        maps = labels / sequence.name
+        runs |= runs_of(sequence, maps, repetitions, dilation_width)
+        made_from[sequence.name] = {
+            "dilation_width": dilation_width,
+            "ablations": results.digest_of_file(__file__),
+            "labels": results.digest_of_files([maps / path.name for path in sequence.frame_paths]),
+            "model": results.made_from(maps),
+        }
+    table = run_all(runs, folder, made_from=made_from, processes=processes).table
+    poses = run_poses(table, folder)
+    true = {sequence.name: sequence.poses for sequence in opened}
+    pairs = zip(table["sequence"], table["run"])
+    table["sim3"] = [metrics.ate(poses[name, run], true[name], "sim3") for name, run in pairs]
+    return table
 
 
 def runs_of(
     sequence: Sequence, labels: Path, repetitions: int = 1, dilation_width: int = CONTROL_WIDTH
-) -> dict[tuple[str, str, int], tuple[OdometrySettings, Masks | None]]:
-    """Return the runs over one sequence: {(method, estimator, repetition): (settings, masks)}.
+) -> dict[Job, Run]:
+    """Return the runs over one sequence, as `runner.run_all` takes them.
 
     labels: folder of the sequence's label maps. "baseline" (all keypoints) and "masked" use each of
     ESTIMATORS, other methods the thesis's and the refined one. A repetition other than 0 is the
     seed that shuffles the matched points.
     """
     methods = _methods(sequence, labels, dilation_width)
-    runs = {}
+    runs: dict[Job, Run] = {}
     for method, estimator, repetition in product(methods, ESTIMATORS, range(repetitions)):
         if estimator == "inliers" and method not in ("baseline", "masked"):
             continue
         settings, method_masks = methods[method]
-        seeded = replace(settings, estimator=estimator, shuffle_seed=repetition or None)
-        runs[method, estimator, repetition] = seeded, method_masks
+        job = Job(sequence.name, method, estimator=estimator, repetition=repetition)
+        runs[job] = sequence, job.changed(settings), method_masks
     return runs
 
 
@@ -215,7 +196,7 @@ def _methods(
     methods: dict[str, tuple[OdometrySettings, Masks | None]] = {
         "baseline": (THESIS, None),
         "masked": (THESIS, thesis_masks),
-        "filter": (replace(THESIS, mask_mode="filter"), thesis_masks),
+        "filter": (replace(THESIS, detector=keypoints.filtered), thesis_masks),
         "nearest": (THESIS, FunctionMasks(nearest)),
         "symmetric": (THESIS, symmetric),
         # Section 5.2.2: trees and bushes
@@ -232,7 +213,7 @@ def _methods(
             methods[prefix + name] = THESIS, chosen
     for name, into in {"turned-into": True, "turned-from": False}.items():
         methods[name] = THESIS, FunctionMasks(partial(half_in_turns, sequence, into))
-    return methods | {"orb": (replace(THESIS, detector="orb"), None)}
+    return methods | {"orb": (replace(THESIS, detector=keypoints.orb), None)}
 
 
 # Keypoints and boundaries one by one

@@ -21,7 +21,7 @@ from thesis_repro.mask_files import LabelMasks
 from thesis_repro.running.settings import Settings
 from thesis_repro.segmentation import augmentation, training
 from thesis_repro.study.jobs import CONTROL_WIDTH
-from thesis_repro.study.methods import masks_of_method, true_labels
+from thesis_repro.study.methods import METHODS, true_labels
 from thesis_repro.study.sources import Source
 
 SMALL = [ID[name] for name in ("pole", "traffic light", "traffic sign", "person")]
@@ -85,7 +85,7 @@ def masks_by_name(drive: Sequence, labels: Path) -> dict[str, Any]:
         "all keypoints": [None] * len(drive),
         "masks": LabelMasks(own_folder, drive, CONTROL_WIDTH),
         "exact boundaries": LabelMasks(own_folder, drive, CONTROL_WIDTH, ablations.EXACT),
-        "random lines": masks_of_method("random-lines", Source(labels), drive, CONTROL_WIDTH),
+        "random lines": METHODS["random-lines"].choose(drive, Source(labels), CONTROL_WIDTH)[1],
     }
     if true_folder.is_dir():
         by_name["true label maps"] = LabelMasks(true_folder, drive, CONTROL_WIDTH)

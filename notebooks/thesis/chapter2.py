@@ -59,8 +59,9 @@ def figure_2_02(
     if len(terms) > 2:
         remark = " (above: the first channel)"
     shown = " + ".join(f"{term:.2f}" if term >= 0 else f"({term:.2f})" for term in terms)
-    total = f"{terms.sum():.2f}{remark}; {feature_map[row, column]:.2f} before rounding"
-    figure.supxlabel(f"y = b + Σ w x = {shown} = {total}", fontsize=9)
+    total, unrounded = f"{terms.sum():.2f}", f"{feature_map[row, column]:.2f}"
+    remark += f"; {unrounded} before rounding" if unrounded != total else ""
+    figure.supxlabel(f"y = b + Σ w x = {shown} = {total}{remark}", fontsize=9)
     return figure
 
 

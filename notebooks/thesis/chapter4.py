@@ -7,7 +7,6 @@ only run.
 Bands and error bars go from the lowest to the highest repetition.
 """
 
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -20,8 +19,7 @@ from matplotlib.patches import Patch
 
 from thesis import frames
 from thesis.flicker import View
-from thesis_repro.odometry import THESIS
-from thesis_repro.odometry.keypoints import detect
+from thesis_repro.odometry.keypoints import spread
 from thesis_repro.report import style
 from thesis_repro.report.style import (
     BASELINE,
@@ -109,23 +107,32 @@ def figure_4_05(
 
 
 def figure_overview(
-    frame: np.ndarray, all_keypoints: np.ndarray, mask: np.ndarray, kept_keypoints: np.ndarray
+    frame: np.ndarray,
+    all_keypoints: np.ndarray,
+    mask: np.ndarray,
+    kept_keypoints: np.ndarray,
+    title: str,
 ) -> plt.Figure:
     """Draw all keypoints of a frame, those on its mask, and 200 that are spread over the frame.
 
-    Keypoints are (n, 2) pixels.
+    Keypoints are (n, 2) pixels. title: of the frame.
     """
-    spread = detect(frame, replace(THESIS, choice="spread", max_keypoints=200))
-    all_title = f"all {len(all_keypoints)} keypoints"
+    few = spread(200)(frame)
+    all_title = f"{title}: all {len(all_keypoints)} keypoints"
     kept_title = f"{len(kept_keypoints)} on the mask (light)"
-    spread_title = f"{len(spread)} spread over the frame"
+    spread_title = f"{len(few)} spread over the frame"
     pictures = {
         all_title: frame,
         kept_title: np.where(mask > 0, frame, frame // 3),
         spread_title: frame,
     }
-    keypoints = {all_title: all_keypoints, kept_title: kept_keypoints, spread_title: spread}
-    return frames.pictures(frame, pictures, keypoints, columns=3)
+    keypoints = {all_title: all_keypoints, kept_title: kept_keypoints, spread_title: few}
+    figure = frames.pictures(frame, pictures)
+    for panel, points in zip(figure.axes, keypoints.values(), strict=True):
+        # two thousand dots must not merge, and two hundred must be seen
+        size = np.clip(2000 / len(points), 1.2, 8)
+        panel.scatter(*points.T, **{**KEYPOINT, "s": size})
+    return figure
 
 
 def _two_digits(value: float) -> str:

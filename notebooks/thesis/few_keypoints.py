@@ -20,6 +20,7 @@ One rule was added when the results were known, because rule 4 also refuses choi
 from collections.abc import Iterable
 from dataclasses import replace
 from functools import partial
+from itertools import product
 from pathlib import Path
 from time import process_time
 from typing import Any
@@ -34,16 +35,18 @@ from thesis.ablations import FunctionMasks, random_keypoints
 from thesis_repro import odometry
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.mask_files import LabelMasks
-from thesis_repro.odometry import THESIS, metrics
+from thesis_repro.odometry import THESIS
+from thesis_repro.odometry.keypoints import filled, spread
 from thesis_repro.report import style, texts
 from thesis_repro.running import results
-from thesis_repro.study import compare, workers
-from thesis_repro.study.jobs import CONTROL_WIDTH, ESTIMATORS
-from thesis_repro.study.runner import CODE
+from thesis_repro.study import compare
+from thesis_repro.study.jobs import CONTROL_WIDTH, ESTIMATORS, Job
+from thesis_repro.study.runner import Run, run_all
+from thesis_repro.study.worth import FILL
 
 NUMBERS = (50, 100, 200, 400, 800)
-FILL = 5  # keypoints in each of 16 x 5 fields of the frame
 SEEDS = (None, 1, 2, 3)  # of the shuffles
+TIMED_RUNS = 5
 LABELS = {
     "all": "all keypoints",
     "strongest": "the strongest",
@@ -53,7 +56,19 @@ LABELS = {
     "filled": f"mask, filled to {FILL} a field",
 }
 ERRORS = {"se3": "aligned ATE", "rotation": "rotation error a frame"}
+COLUMNS = (
+    "sequence",
+    "choice",
+    "number",
+    "estimator",
+    "repetition",
+    "keypoints",
+    "se3",
+    "rotation",
+    "failed",
+)
 MARGINS = {"se3": 1.25, "rotation": 1.1}  # a ratio between 1 / margin and margin is "as good"
+NEAR = 0.8, 1.5  # of the panels that show ratios near 1 enlarged
 
 
 def choices(sequence: Sequence, labels: Path) -> dict[tuple[str, int], tuple]:
@@ -62,14 +77,14 @@ def choices(sequence: Sequence, labels: Path) -> dict[tuple[str, int], tuple]:
     chosen: dict[tuple[str, int], tuple] = {
         ("all", 0): (THESIS, None),
         ("mask", 0): (THESIS, masks),
-        ("filled", 0): (replace(THESIS, fill=FILL), masks),
+        ("filled", 0): (replace(THESIS, detector=filled(FILL)), masks),
     }
     for number in NUMBERS:
         few = replace(THESIS, max_keypoints=number)
         drawn = FunctionMasks(partial(random_keypoints, sequence, number))
         chosen["strongest", number] = few, None
         chosen["random", number] = THESIS, drawn
-        chosen["spread", number] = replace(few, choice="spread"), None
+        chosen["spread", number] = replace(THESIS, detector=spread(number)), None
         chosen["mask", number] = few, masks
     return chosen
 
@@ -86,61 +101,39 @@ def measure(
     labels: a folder with one folder of label maps a sequence. folder: of the results. seeds: that
     shuffle the matched points, one run each; None leaves their order.
     """
-    opened = list(sequences)
-    files = {}
-    for sequence in opened:
-        inputs = {
-            "seeds": list(seeds),
-            "frames": results.digest_of_files(sequence.frame_paths),
-            "labels": results.digest_of_files(sorted((labels / sequence.name).glob("*.png"))),
-            "code": results.digest_of_code(*CODE),
-            **results.made_with("opencv", "numpy", "numba"),
+    runs: dict[Job, Run] = {}
+    made_from = {}
+    for sequence in sequences:
+        maps = labels / sequence.name
+        made_from[sequence.name] = {
+            "choices": results.digest_of_file(__file__),
+            "labels": results.digest_of_files(sorted(maps.glob("*.png"))),
         }
-        files[sequence.name] = results.stage(folder / sequence.name, **inputs) / "runs.csv"
-    calls = [
-        (sequence, labels, files[sequence.name], list(seeds))
-        for sequence in opened
-        if not files[sequence.name].is_file()
-    ]
-    with workers.open_pool(processes) as pool:
-        for _ in pool.run(_measure_one, calls):
-            pass
-    tables = [pd.read_csv(file, dtype={"sequence": str}) for file in files.values()]
-    return pd.concat(tables, ignore_index=True)
-
-
-def _measure_one(sequence: Sequence, labels: Path, file: Path, seeds: Iterable[int | None]) -> None:
-    """Run all choices on one sequence, and write the table of its runs."""
-    runs = {}
-    for (choice, number), (settings, masks) in choices(sequence, labels).items():
-        for estimator in ESTIMATORS:
-            for seed in seeds:
-                changed = replace(settings, estimator=estimator, shuffle_seed=seed)
-                runs[choice, number, estimator, seed or 0] = changed, masks
-    rows = []
-    for (choice, number, estimator, seed), result in odometry.run_many(sequence, runs).items():
-        errors = metrics.errors(result.poses, sequence.poses)
-        steps = metrics.step_errors(result.poses, sequence.poses)
-        row = {
-            "sequence": sequence.name,
-            "choice": choice,
-            "number": number,
-            "estimator": estimator,
-            "repetition": seed,
-            "keypoints": result.frames["detected"].mean(),
-            "se3": errors["se3"],
-            "rotation": steps["rotation"],
-            "failed": int(steps["failed"] > 0 or steps["lost"] > 0),
-        }
-        rows.append(row)
-    results.write_table(file, pd.DataFrame(rows))
+        for (choice, number), (settings, masks) in choices(sequence, labels).items():
+            for estimator, seed in product(ESTIMATORS, seeds):
+                job = Job(
+                    sequence.name,
+                    f"{choice}-{number}",
+                    estimator=estimator,
+                    repetition=seed or 0,
+                )
+                runs[job] = sequence, job.changed(settings), masks
+    table = run_all(runs, folder, made_from=made_from, processes=processes).table
+    chosen = table["method"].str.rpartition("-")
+    return table.assign(
+        choice=chosen[0],
+        number=chosen[2].astype(int),
+        keypoints=table["mean_keypoints"],
+        failed=compare.has_failed(table).astype(int),
+    )[list(COLUMNS)]
 
 
 def time_steps(sequence: Sequence, labels: Path, folder: Path, frames: int = 40) -> pd.DataFrame:
-    """Return the CPU time (milliseconds) of a frame for each choice: its fastest of three runs.
+    """Return the CPU time (milliseconds) of a frame for each choice: its fastest of some runs.
 
     With the thesis's estimator, one thread and the mask made from its label map, without the
-    network. Random choices are left out, because they are drawn from all detected keypoints.
+    network. The choices take turns, so that other programs slow all of them alike. Random choices
+    are left out, because they are drawn from all detected keypoints.
     folder: that of `measure`, which is called before. Times in it are not measured again.
     """
     file = folder / sequence.name / "milliseconds.csv"
@@ -148,17 +141,18 @@ def time_steps(sequence: Sequence, labels: Path, folder: Path, frames: int = 40)
         return pd.read_csv(file)
     cv2.setNumThreads(1)
     excerpt = sequence.subset(frames)
-    rows = []
-    for (choice, number), (settings, masks) in choices(excerpt, labels).items():
-        if choice == "random":
-            continue
-        seconds = []
-        for _ in range(3):
+    timed = {key: run for key, run in choices(excerpt, labels).items() if key[0] != "random"}
+    seconds: dict[tuple[str, int], list[float]] = {key: [] for key in timed}
+    for _ in range(TIMED_RUNS):
+        for key, (settings, masks) in timed.items():
             start = process_time()
             odometry.run(excerpt, settings, masks)
-            seconds.append(process_time() - start)
-        milliseconds = round(1000 * min(seconds) / len(excerpt), 1)
-        rows.append({"choice": choice, "number": number, "milliseconds": milliseconds})
+            seconds[key].append(process_time() - start)
+    # whole ones: repeated measurements differ by more than a millisecond
+    rows = [
+        {"choice": choice, "number": number, "milliseconds": round(1000 * least / len(excerpt))}
+        for (choice, number), least in ((key, min(runs)) for key, runs in seconds.items())
+    ]
     times = pd.DataFrame(rows)
     results.write_table(file, times)
     return times
@@ -187,13 +181,13 @@ def table(runs: pd.DataFrame) -> pd.DataFrame:
                     **{name: numbers[name] for name in ("ratio", "low", "high", "n", "above")},
                     "failed": int(chosen["failed"].sum()),
                     "runs": len(chosen),
-                    **_within(ratios, margin),
+                    **within(ratios, margin),
                 }
                 rows.append(row)
     return pd.DataFrame(rows)
 
 
-def _within(ratios: pd.Series, margin: float) -> dict[str, bool]:
+def within(ratios: pd.Series, margin: float) -> dict[str, bool]:
     """Say whether one-sided tests at 5 % place the ratio within the margin (rules 4, 5)."""
     _, low, high = compare.typical_interval(np.log(ratios), level=90)  # NaN for few sequences
     is_below = bool(high < np.log(margin))
@@ -239,25 +233,29 @@ def _answer(rows: pd.DataFrame, choice: str, number: int, rule: str) -> str:
 def figure(rows: pd.DataFrame, times: pd.DataFrame | None = None) -> Figure:
     """Draw the ratios of both errors against the number of keypoints, and the time of a frame.
 
-    rows: of `table`. times: of `time_steps`, drawn below the errors if given.
+    Ratios near 1 are drawn once more, enlarged; arrows there mark intervals that are cut. rows: of
+    `table`. times: of `time_steps`, drawn below the errors if given.
     """
     more = times is not None
+    scales = [(error, near) for error in ERRORS for near in (False, True)]
     drawing, panels = style.new_figure(
-        len(ERRORS) + more, len(ESTIMATORS), sharex=True, height=5.2 + 1.6 * more
+        len(scales) + more, len(ESTIMATORS), sharex=True, height=9 + 1.6 * more
     )
-    for panel_row, error in zip(panels, ERRORS, strict=False):
+    for panel_row, (error, near) in zip(panels, scales, strict=False):
         for panel, estimator in zip(panel_row, ESTIMATORS, strict=True):
             shown = rows[(rows["error"] == error) & (rows["estimator"] == estimator)]
-            _draw_curves(panel, shown)
-            panel.set_title(f"{ERRORS[error]}, {ESTIMATORS[estimator]}")
-            style.ratio_axis(panel.yaxis, rows[["ratio", "low", "high"]].to_numpy())
+            _draw_curves(panel, shown, near)
+            title = f"{ERRORS[error]}, {ESTIMATORS[estimator]}"
+            panel.set_title(f"the same, {NEAR[0]} to {NEAR[1]}" if near else title)
+            if not near:
+                style.ratio_axis(panel.yaxis, rows[["ratio", "low", "high"]].to_numpy())
         panel_row[0].set_ylabel("ratio to all keypoints")
     if times is not None:
         numbers = rows.drop_duplicates(["choice", "number"])[["choice", "number", "keypoints"]]
         timed = times.merge(numbers, on=["choice", "number"])
         _draw_times(panels[-1, 0], timed)
         panels[-1, 1].axis("off")
-    for panel in (panels[-1, 0], panels[len(ERRORS) - 1, -1]):
+    for panel in (panels[-1, 0], panels[len(scales) - 1, -1]):
         panel.set_xlabel("keypoints a frame")
         panel.tick_params(labelbottom=True)
     style.legend_below(drawing, panels.ravel()[:1], 3)
@@ -276,7 +274,7 @@ def _draw_times(panel: plt.Axes, timed: pd.DataFrame) -> None:
     panel.set_ylim(0)
 
 
-def _draw_curves(panel: plt.Axes, rows: pd.DataFrame) -> None:
+def _draw_curves(panel: plt.Axes, rows: pd.DataFrame, near: bool) -> None:
     panel.axhline(1, color=style.GRAY, linewidth=0.8)
     for index, (choice, label) in enumerate(LABELS.items()):
         of_choice = rows[rows["choice"] == choice].sort_values("keypoints")
@@ -288,6 +286,15 @@ def _draw_curves(panel: plt.Axes, rows: pd.DataFrame) -> None:
         panel.vlines(
             position, of_choice["low"], of_choice["high"], color=look["color"], linewidth=0.9
         )
+        if near:
+            inside = of_choice["ratio"].between(*NEAR)
+            cut_low, cut_high = inside & (of_choice["low"] < NEAR[0]), of_choice["high"] > NEAR[1]
+            for edge, marker, cut in zip(NEAR, "v^", (cut_low, inside & cut_high), strict=True):
+                for place in position[cut]:
+                    mark: dict[str, Any] = {"color": look["color"], "markersize": 4}
+                    panel.plot(place, edge, marker, clip_on=False, **mark)
+    if near:
+        panel.set_ylim(*NEAR)
     panel.set_xscale("log")
     panel.set_xticks([50, 100, 200, 400, 800, 1900], ["50", "100", "200", "400", "800", "1900"])
     panel.minorticks_off()

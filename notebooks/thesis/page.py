@@ -32,8 +32,6 @@ REAL_CHAPTER = "Chapter 4 on real frames"
 # ids of the artefacts at the top of the page
 OPENING = ("findings", "figure_4_05", "figure-comparison")
 
-texts.LOADER.searchpath.append(str(Path(__file__).parent / "templates"))
-
 
 def update(settings: Settings, folder: Path) -> None:
     """Write the page of a run into a folder, with its figures and tables.
@@ -190,10 +188,10 @@ def _links_to_documents(settings: Settings) -> str | None:
 
 
 def _answer(docs: str) -> Markup:
-    """Return the first paragraph of docs/answer.md. docs: the way to that folder."""
+    """Return the answer and what to do of docs/answer.md. docs: the way to that folder."""
     text = (ROOT / "docs" / "answer.md").read_text(encoding="utf-8")
-    paragraph = text.split("\n\n")[1]
-    return texts.html(re.sub(r"\]\((?!\w+:|#)", f"]({docs}/", paragraph))
+    answer, to_do = (part.partition("\n\n")[2] for part in text.split("\n\n## ")[:2])
+    return texts.html(re.sub(r"\]\((?!\w+:|#)", f"]({docs}/", f"{answer}\n\n{to_do}"))
 
 
 def _describe(

@@ -23,7 +23,7 @@ from thesis_repro.running.files import needed, progress, write_text
 from thesis_repro.running.settings import Settings, cores
 from thesis_repro.study import workers
 from thesis_repro.study.jobs import CONTROL_WIDTH, Job
-from thesis_repro.study.runner import checked_masks
+from thesis_repro.study.runner import chosen
 from thesis_repro.study.sources import Source, by_name
 
 STAGES = ("read", "segmentation", "mask", "detection", "tracking", "pose")
@@ -77,13 +77,16 @@ def _time_jobs(
         if {job.name for job in jobs} <= set(earlier["run"]):
             return earlier
     scales = odometry.scales(sequence)
-    masks_by_job, _ = checked_masks(jobs, sequence, sources)
-    odometries = {job: odometry.Odometry(sequence.intrinsics, job.settings) for job in masks_by_job}
-    seconds = dict.fromkeys(masks_by_job, 0.0)
+    runs, _ = chosen(jobs, {sequence.name: sequence}, sources)
+    odometries = {
+        job: odometry.Odometry(sequence.intrinsics, settings)
+        for job, (_, settings, _) in runs.items()
+    }
+    seconds = dict.fromkeys(runs, 0.0)
     with opencv_threads(1):  # one thread makes times comparable
         for index in range(len(sequence)):
             frame = sequence.frame(index)
-            for job, job_masks in masks_by_job.items():
+            for job, (_, _, job_masks) in runs.items():
                 mask_files.forget_edges()  # a separate run would have to find them
                 mask, mask_seconds = None, 0.0
                 if job_masks is not None:

@@ -3,13 +3,12 @@
 `tools/trainings.py` writes the table. It has one row for each training and estimator.
 """
 
-from typing import Any
-
 import pandas as pd
 
 from thesis_repro.running import results
 from thesis_repro.running.files import listed
 from thesis_repro.running.settings import ROOT, Settings
+from thesis_repro.study import jobs
 
 TABLE = ROOT / "figures" / "trainings.csv"
 
@@ -19,23 +18,20 @@ def read() -> pd.DataFrame:
     return pd.read_csv(TABLE)
 
 
-def summary() -> list[dict[str, Any]]:
-    """Return what the trainings give, one dict for each estimator.
+def summary() -> pd.DataFrame:
+    """Return the lowest, median and highest training of each number, and how often which verdict.
 
-    count: of trainings. verdicts: {verdict: number of trainings that give it}, the commonest first.
-    ranges: {column: (lowest, median, highest)} over the trainings, for columns that the estimator
-    has.
+    One row for each estimator and number.
     """
-    trainings = []
+    parts = {}
     for estimator, rows in read().groupby("estimator", sort=False):
         numbers = rows.select_dtypes("number").dropna(axis="columns")
-        low, middle, high = numbers.min(), numbers.median(), numbers.max()
-        ranges = {name: (low[name], middle[name], high[name]) for name in numbers}
-        verdicts = rows["verdict"].value_counts().to_dict()
-        trainings.append(
-            {"estimator": estimator, "count": len(rows), "verdicts": verdicts, "ranges": ranges}
-        )
-    return trainings
+        table = numbers.agg(["min", "median", "max"]).T.round(2).astype(object)
+        counts = rows["verdict"].value_counts().items()
+        table.loc["verdict"] = [", ".join(f"{count} {name}" for name, count in counts), "", ""]
+        parts[jobs.ESTIMATORS[str(estimator)]] = table[["min", "median", "max"]]
+    table = pd.concat(parts, names=["estimator", "number"]).reset_index()
+    return table.rename(columns={"min": "lowest", "max": "highest"})
 
 
 def network_note(settings: Settings) -> str:

@@ -13,15 +13,11 @@ import pytest
 
 import thesis_repro as tr
 from thesis_repro.command import cli
-from thesis_repro.command import options as options_of
 from thesis_repro.command.options import build_parser
 from thesis_repro.data import cityscapes
 from thesis_repro.data.trajectories import read_poses
-from thesis_repro.masks import BOUNDARIES, KEEP
-from thesis_repro.odometry.settings import CHOICES
 from thesis_repro.running import results
 from thesis_repro.running.files import write_png
-from thesis_repro.study.jobs import ESTIMATORS
 
 
 def run(command, *words):
@@ -192,20 +188,3 @@ def test_label_maps_in_other_ids_give_the_same_masks(tiny_kitti, tmp_path):
 def test_wrong_arguments_are_named(call, named):
     with pytest.raises(tr.InputError, match=named):
         call()
-
-
-@pytest.mark.parametrize(
-    "command, option, names",
-    [
-        ("odometry", "--estimator", CHOICES["estimator"]),
-        ("odometry", "--detector", CHOICES["detector"]),
-        ("study", "--estimator", ESTIMATORS),
-        ("masks", "--keep", KEEP),
-        ("masks", "--boundaries", BOUNDARIES),
-    ],
-)
-def test_options_offer_what_the_tables_have(command, option, names):
-    """options.py types the names again, because importing the tables would take a second."""
-    arguments = options_of.COMMANDS[command][option]
-    offered = arguments.get("choices") or arguments["metavar"].split("|")
-    assert list(offered) == list(names), f"command/options.py, {option}"

@@ -1,5 +1,6 @@
 """Frames, poses and label maps as people bring them from other tools and data sets."""
 
+import re
 import shutil
 
 import cv2
@@ -7,7 +8,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from thesis_repro import mask_files
+from thesis_repro import mask_files, odometry
+from thesis_repro.command.cli import main
 from thesis_repro.data import kitti, label_ids
 from thesis_repro.data.cityscapes import COLORS, ID, LABELS, TRAINED
 from thesis_repro.data.trajectories import read_poses, write_tum
@@ -27,20 +29,30 @@ def own(tmp_path, tiny_kitti):
 @pytest.mark.parametrize(
     "stems, said",
     [
-        (["0.1", "0.15", "0.2", "10.0"], True),
-        (["1305031102.175304", "1305031102.211214", "1305031102.243211", "1305031103.0"], True),
-        (["0.10", "0.15", "0.20", "0.90"], False),
-        (["rgb.0009", "rgb.0010", "rgb.0011", "rgb.0012"], False),
+        (["0.1", "0.15", "0.2", "10.0"], "decimal numbers"),
+        (["1305031102.17", "1305031102.2", "1305031102.31", "1305031103.05"], "decimal numbers"),
+        (["0.103774", "0.20755", "0.5", "0.61132521234"], "decimal numbers"),
+        (["10.37800000", "10.141574000", "10.245347000", "11.3"], "seconds and nanoseconds"),
+        (["1.5", "2.25", "3.75", "4.0"], "decimal numbers"),  # one order
+        (["0.10", "0.15", "0.20", "0.90"], None),
+        (["rgb.0009", "rgb.0010", "rgb.0011", "rgb.0012"], None),
     ],
 )
-def test_names_that_are_decimal_numbers_are_ordered_by_value(own, caplog, stems, said):
+def test_names_that_are_numbers_are_in_their_order(own, caplog, stems, said):
     for path, stem in zip(sorted(own.glob("*.png")), stems):
         path.rename(own / f"{stem}.png")
     caplog.set_level("INFO")
     for _ in range(2):
         assert [path.stem for path in kitti.Sequence(None, own).frame_paths] == stems
-    lines = [line for line in caplog.messages if "decimal numbers" in line]
-    assert len(lines) == said
+    lines = [line for line in caplog.messages if "in the order of" in line]
+    assert len(lines) == bool(said) and all(f"names as {said}, " in line for line in lines)
+
+
+def test_names_in_two_possible_orders_are_refused(own):
+    for path, stem in zip(own.glob("*.png"), ["7.37811111", "7.141574123", "7.2453477", "8.3"]):
+        path.rename(own / f"{stem}.png")
+    with pytest.raises(InputError, match="own: 7.*png and the like may be decimal numbers, or"):
+        kitti.Sequence(None, own)
 
 
 def test_assumed_times_are_said_once(own, caplog):
@@ -203,6 +215,43 @@ cam1:
   camera_model: omni
   intrinsics: [1.1, 60, 61, 31, 23]
 """
+ROS = """image_width: 64
+image_height: 48
+camera_name: front
+camera_matrix:
+  rows: 3
+  cols: 3
+  data: [50.0, 0.0, 32.0, 0.0, 51.0, 24.0,
+    0.0, 0.0, 1.0]
+distortion_model: plumb_bob
+distortion_coefficients:
+  rows: 1
+  cols: 4
+  data: [-0.3, 0.1, 0.01, -0.02]
+rectification_matrix:
+  rows: 3
+  cols: 3
+  data: [1, 0, 0, 0, 1, 0, 0, 0, 1]
+"""
+CAMERA_INFO = """header: {frame_id: "front"}
+height: 48
+width: 64
+distortion_model: "plumb_bob"
+D: [-0.3, 0.1, 0.01, -0.02]
+K: [50.0, 0.0, 32.0, 0.0, 51.0, 24.0, 0.0, 0.0, 1.0]
+"""
+EUROC = """sensor_type: camera
+T_BS:
+  cols: 4
+  rows: 4
+  data: [0.0, -1.0, 0.0, -0.02, 1.0, 0.0, 0.0, -0.06, 0.0, 0.0, 1.0, 0.01, 0.0, 0.0, 0.0, 1.0]
+rate_hz: 20
+resolution: [64, 48]
+camera_model: pinhole
+intrinsics: [50.0, 51.0, 32.0, 24.0] #fu, fv, cu, cv
+distortion_model: radial-tangential
+distortion_coefficients: [-0.3, 0.1, 0.01, -0.02]
+"""
 
 
 @pytest.mark.parametrize(
@@ -214,6 +263,10 @@ cam1:
         ("camera.yaml", f'%YAML:1.0\nCamera.type: "PinHole"\n{ORB_SLAM}'),
         ("camera.yaml", ORB_SLAM.replace("Camera.", "Camera1.")),
         ("camera.yml", f"%YAML:1.0\n---\n{OPENCV}"),
+        ("camera.yml", f"image_width: 64\nimage_height: 48\nfisheye_model: 0\n{OPENCV}"),
+        ("camera.yaml", ROS),
+        ("camera.yaml", CAMERA_INFO),
+        ("camera.yaml", EUROC),
     ],
 )
 def test_distortion_is_taken_out_as_opencv_does(own, name, text):
@@ -235,8 +288,7 @@ def test_distortion_is_taken_out_as_opencv_does(own, name, text):
         ("camera.txt", "50 50 32 24 0.1"),
         ("camera.txt", "P0: 50 0 32"),
         ("camera.yaml", "a: [1"),
-        ("camera.yaml", KALIBR.replace("radtan", "equidistant")),
-        ("camera.yaml", KALIBR.replace("pinhole", "omni")),
+        ("camera.yaml", OPENCV.replace(".1, 0.01, -0.02 ]", ".1 ]")),
         ("camera.yaml", KALIBR.replace("intrinsics", "extrinsics")),
         ("camera.yaml", KALIBR.replace("32, 24", "32")),
         ("camera.yaml", ORB_SLAM.replace("p1", "k3").replace("p2", "k4")),  # a fisheye camera
@@ -246,6 +298,47 @@ def test_another_file_is_no_camera(own, name, text):
     (own / name).write_text(text)
     with pytest.raises(InputError, match=f"{name}: must hold fx fy cx cy"):
         kitti.Sequence(None, own, calibration=own / name)
+
+
+@pytest.mark.parametrize(
+    "text, model",
+    [
+        (f"fisheye_model: 1\n{OPENCV}", "fisheye_model is 1"),
+        (KALIBR.replace("radtan", "equidistant"), "distortion_model is equidistant"),
+        (KALIBR.replace("pinhole", "omni"), "camera_model is omni"),
+        (ROS.replace("plumb_bob", "fisheye"), "distortion_model is fisheye"),
+        (f'Camera.type: "KannalaBrandt8"\n{ORB_SLAM}', "Camera.type is KannalaBrandt8"),
+    ],
+)
+def test_a_camera_of_another_model_is_named(own, text, model):
+    (own / "camera.yaml").write_text(text)
+    with pytest.raises(InputError, match=f"camera.yaml: {model}"):
+        kitti.Sequence(None, own, calibration=own / "camera.yaml")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"image_width: 80\nimage_height: 60\n{OPENCV}",
+        ROS.replace("image_width: 64", "image_width: 128"),
+        CAMERA_INFO.replace("height: 48", "height: 50"),
+        EUROC.replace("64, 48", "48, 64"),
+        KALIBR.replace("64, 48", "640, 480"),
+        f"Camera.width: 63\nCamera.height: 48\n{ORB_SLAM}",
+    ],
+)
+def test_a_camera_of_frames_of_another_size_is_named(own, text):
+    (own / "camera.yaml").write_text(text)
+    sequence = kitti.Sequence(None, own, calibration=own / "camera.yaml")
+    with pytest.raises(InputError, match=r"camera.yaml: .*, but .*000000.png has 64x48"):
+        sequence.frame(0)
+
+
+def test_a_rough_camera_is_four_numbers(own):
+    (own / "camera.txt").write_text("64 64 32 24")
+    sequence = kitti.Sequence(None, own, calibration=own / "camera.txt")
+    assert np.array_equal(sequence.intrinsics, [[64, 0, 32], [0, 64, 24], [0, 0, 1]])
+    assert np.array_equal(sequence.frame(0), kitti.Sequence(None, own).frame(0))
 
 
 def test_frames_of_16_bits_are_scaled_by_their_maximum(own, caplog):
@@ -298,3 +391,73 @@ def test_what_is_no_mask_is_named(tmp_path):
     (tmp_path / "a.png").write_bytes(b"no picture")
     with pytest.raises(InputError, match="a.png: "):
         mask_files.read_mask(tmp_path / "a.png")
+
+
+def picture_frames(own, hidden, alpha):
+    """Give the frames a hidden part: transparent, or black."""
+    for path in sorted(own.glob("*.png")):
+        pixels = np.where(hidden, 0, cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)).astype(np.uint8)
+        if alpha:
+            opaque = np.where(hidden, 0, 255).astype(np.uint8)
+            pixels = np.dstack([pixels, pixels, pixels, opaque])
+        cv2.imwrite(str(path), pixels)
+
+
+@pytest.mark.parametrize("alpha", [True, False])
+def test_no_keypoints_in_transparent_parts_and_black_borders(own, alpha):
+    hidden = np.zeros((48, 64), bool)
+    hidden[:5], hidden[:, 60:] = True, True
+    plain = kitti.Sequence(None, own)
+    assert plain.visible(0) is None
+    with pytest.raises(InputError, match="own: frames have no black border"):
+        plain.without_border()
+    picture_frames(own, hidden, alpha)
+    sequence = kitti.Sequence(None, own)
+    if not alpha:
+        assert sequence.visible(1) is None
+        sequence = sequence.without_border()
+    expected = np.zeros((48, 64), np.uint8)
+    expected[15:, :50] = 255  # ten pixels away
+    assert np.array_equal(sequence.subset(2).visible(1), expected)
+    detected = []
+
+    def detect(frame, settings, mask):
+        detected.append(mask)
+        return odometry.OPENCV.detect(frame, settings, mask)
+
+    calls = odometry.OPENCV._replace(detect=detect)
+    for masks, inner in ((None, expected), ([BINARY] * 4, expected & BINARY)):
+        odometry.run(sequence, masks=masks, calls=calls)
+        assert all(np.array_equal(mask, inner) for mask in detected) and len(detected) > 1
+        detected.clear()
+    alone = odometry.run(sequence, masks=[BINARY] * 4)
+    together = odometry.run_many(sequence, {1: (odometry.THESIS, [BINARY] * 4)})[1]
+    assert np.array_equal(alone.poses, together.poses)
+    assert alone.frames["detected"].equals(together.frames["detected"])
+
+
+def test_what_the_camera_did_not_see_has_no_keypoints(own):
+    (own / "camera.txt").write_text("50 50 32 24 0.4 0 0 0")
+    sequence = kitti.Sequence(None, own, calibration=own / "camera.txt")
+    black = sequence.undistorted(np.full((48, 64), 255, np.uint8)) == 0
+    visible = sequence.visible(0) > 0
+    assert black.any() and visible.any() and not visible[black].any()
+
+
+@pytest.mark.parametrize(
+    "options, said",
+    [
+        ("--output path.txt --tum path.txt", "--output, --tum: both are path.txt"),
+        ("--tum ./path.txt --output path.txt", "--output, --tum: both are"),
+        ("--speed -3", "speed -3: must be"),
+        ("--speed 0", "speed 0: must be"),
+        ("--sequence drive.mp4", "drive.mp4: is a file; .*own-masks.md"),
+    ],
+)
+def test_names_and_numbers_that_cannot_be_are_one_line(own, options, said, monkeypatch, capsys):
+    monkeypatch.chdir(own.parent)
+    (own.parent / "drive.mp4").write_bytes(b"video")
+    assert main(["odometry", "--sequence", str(own), *options.split()]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert re.match(f"error: .*{said}", line)
+    assert not (own.parent / "path.txt").exists()

@@ -120,3 +120,27 @@ def test_errors_of_a_run():
     assert errors["se3"] == metrics.ate(estimated, true, "se3") < errors["rmse"]
     assert errors["rmse"] == metrics.rmse(estimated, true)
     assert metrics.errors(true[:5], true[:5])["rmse"] == 0
+
+
+AXES = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])  # x forward, z up
+
+
+@pytest.mark.parametrize(
+    "change, kind",
+    [
+        (lambda poses: poses, None),
+        (np.linalg.inv, "inverse"),
+        (lambda poses: poses[::-1], "reversed"),
+        (lambda poses: AXES @ poses @ AXES.T, "turned"),
+        (lambda poses: poses[np.random.default_rng(0).permutation(len(poses))], ""),
+    ],
+)
+def test_true_poses_that_are_not_the_cameras_are_told(change, kind):
+    true = winding(60)
+    estimated = true.copy()
+    estimated[:, :3, 3] += np.random.default_rng(1).normal(0, 0.05, (60, 3))
+    reason = metrics.foreign_truth(estimated, change(true))
+    assert reason == "" if kind is None else metrics.TRUTH_KINDS[kind] in reason
+    # what did not move, and too few steps, say nothing
+    assert metrics.foreign_truth(np.tile(np.eye(4), (60, 1, 1)), change(true)) == ""
+    assert metrics.foreign_truth(estimated[:9], change(true)[:9]) == ""

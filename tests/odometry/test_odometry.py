@@ -1,5 +1,7 @@
 """The odometry against PySLAM's runs, its rules for bad frames, and its settings."""
 
+import json
+import pickle
 import re
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -24,7 +26,8 @@ from thesis_repro.odometry import (
     metrics,
     sharing,
 )
-from thesis_repro.odometry.odometry import normalise, track
+from thesis_repro.odometry.estimators import ESTIMATORS, refined
+from thesis_repro.odometry.odometry import VoteOfAll, detect, normalise, track
 from thesis_repro.odometry.types import ROTATION_COLUMNS
 from thesis_repro.running.settings import ROOT
 
@@ -116,7 +119,7 @@ def test_keypoints_have_opencvs_bits(drive, mask):
 
 def test_tracks_have_opencvs_bits(drive):
     frame = drive.frame(3)
-    points = keypoints.detect(frame)
+    points = detect(frame)
     # at -40 a window leaves the frame
     for shift, window in ((3, 21), (12, 21), (-40, 21), (12, 11)):
         moved, settings = np.roll(frame, shift, axis=1), replace(THESIS, window=window)
@@ -128,8 +131,7 @@ def test_tracks_have_opencvs_bits(drive):
 
 def test_a_mask_in_the_detector_fills_the_limit_and_a_filter_does_not(drive):
     inside, filtered = (
-        keypoints.detect(drive.frame(0), replace(SMALL, mask_mode=mode), Stripes(40)[0])
-        for mode in ("detect", "filter")
+        find(drive.frame(0), SMALL, Stripes(40)[0]) for find in (detect, keypoints.filtered)
     )
     assert len(inside) == 500 and 100 < len(filtered) < 400
 
@@ -141,25 +143,25 @@ def nearest_neighbours(points):
 
 def test_spread_keypoints_are_as_many_and_farther_apart(drive):
     frame = drive.frame(0)
-    everything = keypoints.detect(frame, replace(THESIS, max_keypoints=0))
-    corners = keypoints.detect(frame, replace(THESIS, max_keypoints=0, min_distance=0))
-    spread = keypoints.detect(frame, replace(THESIS, max_keypoints=100, choice="spread"))
+    everything = detect(frame, replace(THESIS, max_keypoints=0))
+    corners = detect(frame, replace(THESIS, max_keypoints=0, min_distance=0))
+    spread = keypoints.spread(100)(frame)
     assert len(spread) == len(everything[:100]) == 100
     assert {*map(tuple, spread)} <= {*map(tuple, corners)}
     assert nearest_neighbours(spread).min() > 2 * nearest_neighbours(everything[:100]).min()
     # the strongest one is always taken, and as many as there are if those are fewer
     np.testing.assert_array_equal(spread[0], everything[0])
-    all_spread = keypoints.detect(frame, replace(THESIS, max_keypoints=10**6, choice="spread"))
+    all_spread = keypoints.spread(10**6)(frame)
     np.testing.assert_array_equal(all_spread, everything)
 
 
 def test_a_filled_mask_leaves_no_field_empty(drive):
     frame, mask = drive.frame(0), np.zeros(drive.size, np.uint8)
     mask[:, :240] = 255
-    plain = keypoints.detect(frame, THESIS, mask)
-    filled = keypoints.detect(frame, replace(THESIS, fill=3), mask)
+    plain = detect(frame, THESIS, mask)
+    filled = keypoints.filled(3)(frame, THESIS, mask)
     np.testing.assert_array_equal(filled[: len(plain)], plain)
-    everything = keypoints.detect(frame, replace(THESIS, max_keypoints=0))
+    everything = detect(frame, replace(THESIS, max_keypoints=0))
     for row, column in np.ndindex(5, 16):
         counts = [
             (points // (30, 32) == (column, row)).all(axis=1).sum()
@@ -189,8 +191,23 @@ class Changed(Street):
 
 def standing(drive):
     sequence = Changed(drive, poses=np.insert(drive.poses, 5, drive.poses[4], axis=0))
-    sequence.images.insert(5, drive.frame(4).copy())
+    image = drive.frame(4).copy()
+    image[0, 0] ^= 1
+    sequence.images.insert(5, image)
     return sequence
+
+
+def doubled(drive):
+    """Frames 0 and 3 come twice and three times, as where a camera stands."""
+    indices = np.insert(np.arange(len(drive)), [1, 4, 4], [0, 3, 3])
+    sequence = Changed(drive, poses=drive.poses[indices])
+    sequence.images = [drive.images[index] for index in indices]
+    return sequence
+
+
+def stalled(drive):
+    """The camera drives on, but gives frame 4 twice."""
+    return Changed(drive, {5: drive.frame(4).copy()})
 
 
 def cut(drive):
@@ -217,8 +234,10 @@ BAD = {
     ),
     "an empty mask": (Changed, {}, (4,), {4: "no keypoints"}),
     "empty masks": (excerpt, {}, range(3), NO_POINTS),
-    "an empty filter": (excerpt, {"mask_mode": "filter"}, range(3), NO_POINTS),
+    "an empty filter": (excerpt, {"detector": keypoints.filtered}, range(3), NO_POINTS),
     "standing": (standing, {}, (), {5: "stationary"}),
+    "equal frames": (doubled, {}, (), dict.fromkeys((1, 5, 6), "equal frame")),
+    "a stalled camera": (stalled, {}, (), {5: "equal frame"}),
     "a scene cut": (cut, {}, (), {5: "no agreement"}),
 }
 
@@ -239,13 +258,20 @@ def test_bad_frames_are_flagged_and_keep_the_pose(drive, case):
         # without new keypoints, points are tracked further
         assert moved == (expected.get(index, "") in ("", "no keypoints"))
         assert np.array_equal(result.poses[index], result.poses[index - 1]) != moved
-    if case == "black and blown out":  # the step to frame 6 is measured from frame 4
+    if case == "equal frames":  # the path is that without them
+        kept = np.delete(result.poses, [1, 5, 6], axis=0)
+        np.testing.assert_array_equal(kept, odometry.run(drive).poses)
+        assert result.failed_steps == 0
+    if case in (
+        "black and blown out",
+        "a stalled camera",
+    ):  # the step to frame 6 is measured from frame 4
         assert result.frames["scale"][6] == pytest.approx(2 * result.frames["scale"][4])
 
 
-@pytest.mark.parametrize("estimator", ["thesis", "inliers", "refined"])
+@pytest.mark.parametrize("estimator", ESTIMATORS)
 def test_too_large_turns_are_flagged_and_kept(drive, monkeypatch, estimator):
-    few, settings = Changed(drive, frames=4), replace(THESIS, estimator=estimator)
+    few, settings = Changed(drive, frames=4), replace(THESIS, estimator=ESTIMATORS[estimator].make)
     plain = odometry.run(few, settings)
     monkeypatch.setattr(odometry.odometry, "MAX_TURN", 0.05)
     flagged = odometry.run(few, settings)
@@ -283,7 +309,40 @@ def test_own_functions_take_the_places_of_opencvs_calls(drive):
     assert metrics.rmse(result.poses[:3], few.poses[:3]) < 0.05
 
 
+class LeastMedian(VoteOfAll):
+    """An estimator that brings its own search."""
+
+    def search(self, current, previous, threshold):
+        return cv2.findEssentialMat(current, previous, 1.0, (0, 0), cv2.LMEDS, 0.999)
+
+
+@pytest.mark.parametrize("make", [separately, odometry.run_many], ids=["run", "run_many"])
+def test_an_estimator_may_bring_its_own_search(drive, monkeypatch, make):
+    few = Changed(drive, frames=4)
+    ransac = counted(monkeypatch, cv2, "findEssentialMat")
+    exact = counted(monkeypatch, sharing.opencv_exact, "find_essential_matrix")
+    result = make(few, {"": (replace(THESIS, estimator=LeastMedian), None)})[""]
+    assert not exact and {call[4] for call in ransac} == {cv2.LMEDS}
+    assert metrics.rmse(result.poses, few.poses) < 0.1 and result.flagged.empty
+    monkeypatch.setattr(
+        LeastMedian, "search", lambda *points: (np.eye(3), np.zeros(len(points[1])))
+    )
+    assert set(flags(odometry.run(few, result.settings)).values()) == {"no agreement"}
+
+
 # Settings
+
+
+def test_settings_are_equal_elsewhere_and_so_is_their_record():
+    made = replace(THESIS, detector=keypoints.filled(3, keypoints.spread(20)), estimator=refined)
+    assert pickle.loads(pickle.dumps(made)) == made != replace(made, detector=keypoints.filled(3))
+    record = made.record()
+    assert (
+        record["detector"] == "filled(3, spread(20))" and json.loads(json.dumps(record)) == record
+    )
+    assert record["estimator"] == "thesis_repro.odometry.estimators.refined"
+    with pytest.raises(InputError, match="number of keypoints"):
+        keypoints.spread(0)
 
 
 def test_shuffled_points_change_the_path_and_repeat_with_the_seed(drive):
@@ -316,7 +375,7 @@ def test_inliers_of_shuffled_points_are_in_their_order(drive):
 SETTINGS = {
     "thesis": THESIS,
     "tracked on": replace(THESIS, redetect_below=10),
-    "refined": replace(THESIS, estimator="refined"),
+    "refined": replace(THESIS, estimator=refined),
 }
 
 
@@ -346,10 +405,10 @@ def variants():
         "stripes-20": (SMALL, Stripes(20)),
         "all": (THESIS, None),
         "reduced": (replace(THESIS, max_keypoints=300), None),
-        "refined": (replace(SMALL, estimator="refined"), None),
+        "refined": (replace(SMALL, estimator=refined), None),
         "kept": (replace(SMALL, redetect_below=450), None),  # tracks fractional positions on
-        "filter": (replace(SMALL, mask_mode="filter", min_distance=4.5), Stripes(40)),
-        "orb": (replace(SMALL, detector="orb"), Stripes(40)),
+        "filter": (replace(SMALL, detector=keypoints.filtered, min_distance=4.5), Stripes(40)),
+        "orb": (replace(SMALL, detector=keypoints.orb), Stripes(40)),
         "empty": (THESIS, [BLACK] * 10),
     }
 
@@ -385,9 +444,9 @@ def counted(monkeypatch, module, name):
 def test_runs_of_one_tracking_share_masks_and_essential_matrices(drive, monkeypatch):
     stripes, few = Stripes(20), Changed(drive, frames=6)
     runs = {
-        (seed, estimator): (replace(THESIS, shuffle_seed=seed, estimator=estimator), stripes)
+        (seed, make): (replace(THESIS, shuffle_seed=seed, estimator=make), stripes)
         for seed in (None, 1)
-        for estimator in ("thesis", "refined")
+        for make in (None, refined)
     }
     searched = counted(monkeypatch, sharing.opencv_exact, "find_essential_matrix")
     asked = counted(monkeypatch, Stripes, "__getitem__")
@@ -412,7 +471,7 @@ def test_runs_share_no_keypoints_if_a_setting_differs_that_may_matter(
     drive, monkeypatch, setting, value, times
 ):
     few, settings = Changed(drive, frames=3), NewSettings(max_keypoints=300)
-    searched = counted(monkeypatch, sharing.keypoints, "detect")
+    searched = counted(monkeypatch, sharing.corners, "detect")
     runs = {"first": (settings, None), "second": (replace(settings, **{setting: value}), None)}
     odometry.run_many(few, runs)
     assert len(searched) == times * len(few)
@@ -428,7 +487,6 @@ def test_runs_share_no_keypoints_if_a_setting_differs_that_may_matter(
         ("detector", "fast"),
         ("max_keypoints", -1),
         ("threshold", 0.0),
-        ("choice", "best"),
     ],
 )
 def test_wrong_settings_are_named(setting, value):

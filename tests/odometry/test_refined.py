@@ -10,6 +10,7 @@ from street import Street
 
 from thesis_repro import odometry
 from thesis_repro.odometry import THESIS, Matches, metrics
+from thesis_repro.odometry.estimators import refined
 from thesis_repro.odometry.refined import RefinedEstimator
 from thesis_repro.odometry.refined import fit as refine
 from thesis_repro.odometry.refined.motion_prior import (
@@ -21,7 +22,7 @@ from thesis_repro.odometry.refined.motion_prior import (
 
 AHEAD = np.array([0.0, 0.0, 1.0])
 SIDEWAYS = np.array([1.0, 0.0, 0.0])
-REFINED = replace(THESIS, estimator="refined")
+REFINED = replace(THESIS, estimator=refined)
 
 
 def turn(degrees):

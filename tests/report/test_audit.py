@@ -10,10 +10,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from thesis import ablations, audit, audit_rows, audit_run, domain_gap, trainings
+from thesis import ablations, audit, audit_rows, audit_run, domain_gap, thesis_tables, trainings
 from thesis_repro.data.cityscapes import ID
 from thesis_repro.report import style
 from thesis_repro.running import results
+from thesis_repro.running.settings import ROOT
 from thesis_repro.study import compare
 
 
@@ -23,8 +24,8 @@ def test_rows_are_numbered_and_every_measurement_has_a_row():
     assert all(
         row[key].strip() for row in audit.ROWS for key in ("where", "does", "right", "switch")
     )
-    with pytest.raises(KeyError, match="96"):
-        audit.table([audit.measurement("13", "spread", 1), audit.measurement("96", "spread", 1)])
+    with pytest.raises(KeyError, match="999"):
+        audit.table([audit.measurement("13", "spread", 1), audit.measurement("999", "spread", 1)])
 
 
 @pytest.mark.parametrize(
@@ -38,7 +39,12 @@ def test_rows_are_numbered_and_every_measurement_has_a_row():
         ("4", "sequences with a larger error", "MAE", 7),
         ("41", "sequences improved", "RMSE", 6),
         ("41", "sequences improved on average if masks did nothing", "RMSE", 10.3125),
-        ("41", "probability of no more improved sequences if masks did nothing", "RMSE", 0.0335),
+        (
+            "41",
+            "probability of no more improved sequences if masks did nothing, 15 independent widths",
+            "RMSE",
+            0.0335,
+        ),
         ("60", "keypoints, means of Table 4.1", "", 761.7),
     ],
 )
@@ -48,6 +54,37 @@ def test_arithmetic_with_the_thesiss_tables(row, quantity, metric, value):
         (table["row"] == row) & (table["quantity"] == quantity) & (table["metric"] == metric)
     ]
     assert rows["value"].item() == pytest.approx(value, abs=0.011)
+
+
+def test_alike_widths_count_as_one_and_unlike_ones_as_all():
+    random, widths = np.random.default_rng(0), 15
+    keys = pd.MultiIndex.from_product(
+        [map(str, range(400)), [0], range(1, widths + 1)],
+        names=["sequence", "repetition", "dilation_width"],
+    )
+    of_sequence = np.repeat(random.normal(size=400), widths)
+    level = pd.DataFrame({"sequence": keys.levels[0], "rmse": np.exp(2.0)})
+    for errors, expected in (
+        (of_sequence, 1),
+        (random.normal(size=len(keys)), widths),
+        (of_sequence + random.normal(size=len(keys)), widths / (1 + (widths - 1) / 2)),
+    ):
+        masked = pd.DataFrame({"rmse": np.exp(2 + errors)}, keys).reset_index()
+        _, number = thesis_tables.independent_widths(masked, level, "rmse")
+        assert number == pytest.approx(expected, rel=0.15)
+
+
+@pytest.mark.parametrize("folder", ["figures", "figures/kitti_excerpts"])
+def test_the_audit_has_the_times_of_the_budget_beside_it(folder):
+    rows = pd.read_csv(ROOT / folder / "audit.csv", dtype={"row": str})
+    budget = pd.read_csv(ROOT / folder / "budget.csv", index_col="stage")
+    stages = [stage for stage in budget.index if not stage.startswith(("all", "frames"))]
+    named = rows[rows["row"] == "49"].set_index("metric")["value"].add_suffix(" (ms)")
+    masked = budget["masked, width 10"]
+    assert named[stages].to_numpy() == pytest.approx(masked[stages].to_numpy(), abs=0.006)
+    (whole,) = rows.loc[rows["row"] == "16", "value"]
+    every = budget.loc[stages, "all keypoints"].sum()
+    assert whole == pytest.approx(masked[stages].sum() / every, rel=2e-3)
 
 
 def test_rows_without_a_measurement_stay_and_words_appear_once():

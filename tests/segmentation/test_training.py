@@ -145,19 +145,6 @@ def test_each_epoch_shows_each_image_once_in_another_order():
     assert seen[0] != seen[1] == seen[2]
 
 
-def test_fresh_augmentation_replaces_the_second_set_in_every_epoch():
-    sets = [SETS[:2], (np.zeros_like(SETS[0]), SETS[1])]
-    transforms = augmentation.training_augmenter(SIZE)
-    batches, changed = training.Batches(sets, 18, seed=0, transforms=transforms), []
-    for batches.epoch in (0, 1):
-        images = {image.tobytes() for image in next(iter(batches))[0]}
-        changed.append(images - {image.tobytes() for image in SETS[0]})
-    assert len(changed[0]) == len(changed[1]) == 9 and not changed[0] & changed[1]
-    seed = augmentation.image_seed(0, 3, epoch=1)
-    fresh, _ = augmentation.augment(transforms, SETS[0][3], SETS[1][3], seed)
-    assert fresh.tobytes() in changed[1]
-
-
 @pytest.mark.parametrize("at", [2, 12])
 def test_an_interrupted_training_goes_on_in_the_same_kernel(trained, tmp_path, at):
     run = fit(tmp_path, interrupted=at)
@@ -239,3 +226,51 @@ def test_one_core_and_all_give_the_same_bits(digest):
 @pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="recorded on x86")
 def test_the_training_gives_the_recorded_bits(digest):
     assert digest == RECORDED
+
+
+@pytest.mark.parametrize("broken", [0, 1])
+def test_a_training_stops_at_a_loss_that_is_not_finite(tmp_path, broken):
+    model, batches, validation = prepared()
+    best = keras.callbacks.ModelCheckpoint(tmp_path / training.MODEL, save_best_only=True)
+    resumable = training.ResumableTraining(tmp_path, batches, [best])
+
+    def break_weights(epoch, logs):
+        if epoch == broken:
+            kernel = model.get_layer("classes").kernel
+            kernel.assign(np.full(kernel.shape, np.nan))
+
+    callbacks = [best, keras.callbacks.LambdaCallback(on_epoch_begin=break_weights), resumable]
+    with pytest.raises(InputError, match=f"the loss of epoch {broken + 1} is nan"):
+        model.fit(
+            batches.dataset(),
+            validation_data=validation.dataset(),
+            epochs=3,
+            verbose=0,
+            callbacks=callbacks,
+        )
+    assert len(resumable.history) == broken
+    assert (tmp_path / training.MODEL).exists() == bool(broken)
+    if broken:  # the best network and the checkpoint are those of the first epoch
+        kept = training.load_model(tmp_path / training.MODEL)
+        callbacks[1:2] = []
+        model.fit(batches.dataset(), epochs=1, verbose=0, callbacks=callbacks)
+        assert all(map(np.array_equal, kept.get_weights(), model.get_weights()))
+
+
+def test_weights_that_are_not_finite_are_refused(tmp_path):
+    model = network(2)
+    model.get_layer("classes").bias.assign([np.nan, *[0] * 34])
+    model.save(tmp_path / "broken.keras")
+    with pytest.raises(InputError, match="broken.keras: has weights that are no finite"):
+        training.load_model(tmp_path / "broken.keras")
+
+
+def test_ids_and_sizes_that_cannot_be_batches_are_named():
+    images, labels = street(2, 0)
+    unknown = labels.copy()
+    unknown[1, 3, 3] = 35
+    for label_maps, size, said in ((unknown, 2, "label map 1: holds 35"), (labels, 0, "size 0")):
+        with pytest.raises(InputError, match=said):
+            training.Batches([(images, label_maps)], size)
+    unknown[1, 3, 3] = 255
+    assert len(training.Batches([(images, unknown)], 2)) == 1

@@ -12,6 +12,7 @@ from thesis import ablations, thesis_tables
 from thesis_repro import mask_files, masks
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.odometry import THESIS, keypoints
+from thesis_repro.odometry.odometry import detect
 from thesis_repro.study import compare, methods, runner
 from thesis_repro.study.jobs import first_jobs
 from thesis_repro.study.sources import Source
@@ -30,7 +31,7 @@ def made(sequence, small_labels):
     source = Source(small_labels)
     by_method = {"masked": mask_files.LabelMasks(small_labels / "00", sequence, WIDTH)}
     for method in methods.MASK_CONTROLS:
-        by_method[method] = methods.masks_of_method(method, source, sequence, WIDTH)
+        _, by_method[method] = methods.METHODS[method].choose(sequence, source, WIDTH)
     return by_method
 
 
@@ -85,12 +86,12 @@ def test_random_lines_and_image_edges_cover_as_much_as_the_mask(sequence, made):
 
 
 def test_spread_keypoints_have_the_asked_number(sequence):
-    counts = [len(keypoints.detect(frame, THESIS)) for frame in sequence.frames()]
+    counts = [len(detect(frame, THESIS)) for frame in sequence.frames()]
     target = np.mean(counts) / 2
     distance = methods.min_distance(sequence, target)
     assert distance > THESIS.min_distance and distance == round(distance, 1)
     spread = replace(THESIS, min_distance=distance)
-    left = np.mean([len(keypoints.detect(frame, spread)) for frame in sequence.frames()])
+    left = np.mean([len(detect(frame, spread)) for frame in sequence.frames()])
     assert left == pytest.approx(target, rel=0.03)
     assert methods.min_distance(sequence, max(counts)) == THESIS.min_distance
 
@@ -123,12 +124,13 @@ def test_controls_leave_as_many_keypoints_as_masks_of_the_tested_width(
 def test_every_ablation_differs_from_its_reference_in_one_thing(small_world, small_labels):
     sequence = Sequence(small_world / "kitti", "00").subset(4)
     runs = ablations.runs_of(sequence, small_labels / "00", repetitions=2)
+    runs = {(job.method, job.estimator, job.repetition): run[1:] for job, run in runs.items()}
     settings, thesis_masks = runs["masked", "thesis", 0]
     assert settings == THESIS
     expected = mask_files.LabelMasks(small_labels / "00", sequence, 10)
     assert np.array_equal(thesis_masks[0], expected[0])
     dropped, same = runs["filter", "thesis", 0]
-    assert dropped.mask_mode == "filter" and same is thesis_masks
+    assert dropped.detector is keypoints.filtered and same is thesis_masks
     repetitions = {
         estimator: {key[2] for key in runs if key[:2] == ("baseline", estimator)}
         for estimator in ("thesis", "refined")

@@ -337,3 +337,23 @@ def test_a_sequence_named_like_a_column_of_the_tables_is_refused(tiny_kitti):
     study = Study(tiny_kitti, ("ratio",), (), (5,))
     with pytest.raises(InputError, match="ratio: has the name of a column"):
         study.check()
+
+
+def test_a_study_without_ground_truth_says_what_keypoints_are_worth(
+    small_world, masks, tmp_path, capsys
+):
+    folder = tmp_path / "kitti" / "sequences" / "00"
+    folder.parent.mkdir(parents=True)
+    folder.symlink_to(small_world / "kitti" / "sequences" / "00")
+    where = ["--kitti", tmp_path / "kitti", "--frames", 4, "--output", tmp_path / "out"]
+    words = ["study", *where, "--masks", f"mine={masks}", "--jobs", 1]
+    assert main(list(map(str, words))) == 0
+    table = pd.read_csv(tmp_path / "out" / "worth_runs.csv", dtype={"sequence": str})
+    assert {"random keypoints", "spread keypoints", "mine: masks"} < set(table["choice"])
+    assert (table["steps"] == 3).all() and (table[["rotation", "direction"]] > 0).all(axis=None)
+    shown = pd.read_csv(tmp_path / "out" / "worth.csv")
+    assert list(shown["choice"]) == list(table["choice"].unique())
+    assert (tmp_path / "out" / "worth.svg").is_file()
+    again = (tmp_path / "out" / "worth" / "00" / "400.csv").stat().st_mtime_ns
+    assert main(list(map(str, words))) == 0  # reads what is there
+    assert (tmp_path / "out" / "worth" / "00" / "400.csv").stat().st_mtime_ns == again

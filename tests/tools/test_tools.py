@@ -93,7 +93,14 @@ def test_evidence_keeps_what_shows_no_frame_and_compares_label_maps(
     out = tmp_path / "out"
     evidence.write(settings, out, others)
     names = {"README", "failures", "label_quality", "streets", "few_keypoints"}
-    names |= {"few_keypoints_runs", *evidence.KEPT, *evidence.RUNS}
+    names |= {
+        "worth",
+        "worth_runs",
+        "choices",
+        "few_keypoints_runs",
+        *evidence.KEPT,
+        *evidence.RUNS,
+    }
     assert {path.stem for path in out.iterdir()} == names
     failures = pd.read_csv(out / "failures.csv")
     assert list(failures["steps"][:2]) == ["00", "01"]

@@ -5,8 +5,7 @@ import os
 import sys
 from collections.abc import Iterable, Iterator
 from contextlib import redirect_stdout, suppress
-from dataclasses import fields, replace
-from importlib import import_module
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -23,8 +22,6 @@ OUTPUT_FILES: dict[str, tuple[str, tuple[str, ...]]] = {
     "tum": ("poses in TUM format", ()),
     "plot": ("figure of the paths", (".png", ".svg", ".pdf", ".jpg")),
 }
-# settings of the odometry that a study changes in runs with masks only; --scale-gate is for all
-OF_MASKED = ("choice", "max_keypoints", "fill")
 
 
 # The commands, see COMMANDS. Their docstrings are shown by --help. Each imports its libraries
@@ -95,12 +92,19 @@ def masks(options: Any) -> None:
 def odometry(options: Any) -> None:
     """Run the visual odometry on one sequence; print its errors, number of keypoints and time."""
     with redirect_stdout(sys.stderr):  # evo prints a line when it first writes its own settings
-        import_module("evo.main_ape")
+        import evo.main_ape  # noqa: F401
     from thesis_repro import checks, odometry
     from thesis_repro.data.trajectories import write_kitti_poses, write_tum
     from thesis_repro.odometry import metrics
+    from thesis_repro.odometry.estimators import ESTIMATORS
 
-    settings = replace(odometry.THESIS, **_odometry_settings(options))
+    settings = replace(
+        odometry.THESIS,
+        detector=_detector(options),
+        estimator=ESTIMATORS[options.estimator].make,
+        max_keypoints=options.max_keypoints,
+        scale_gate=options.scale_gate,
+    )
     sequence = _sequence(options)
     masks = _masks(options, sequence)
     _check_outputs(options, sequence.poses_path, options.masks, options.labels, sequence.folder)
@@ -112,6 +116,9 @@ def odometry(options: Any) -> None:
         write_tum(options.tum, result.poses, sequence.times)
     steps = len(sequence), result.failed_steps, result.dropped_steps
     _warn(checks.of_run(sequence.name, *steps, settings.scale_gate))
+    if sequence.has_truth:
+        reason = metrics.foreign_truth(result.poses, sequence.poses)
+        _warn([f"{sequence.poses_path}: {reason}"] * bool(reason))
     record = _record(result, sequence)
     if options.plot:
         from thesis_repro.report import paths, style
@@ -148,28 +155,28 @@ def study(options: Any) -> int:
         )
     kinds = {kind for kind, _, _ in options.sources}
     has_labels = "labels" in kinds
+    mask_settings = _mask_settings(options, has_labels)
     if options.widths and not has_labels:
         raise InputError("--widths: only masks from label maps (--labels) have a width")
     if options.invert and "masks" not in kinds:
         raise InputError("--invert: needs --masks DIR")
     widths: set[int] = set()
     if has_labels:
-        all_widths = ALL_WIDTHS
-        if options.keep == "static":
-            all_widths = (options.controls or 1,)  # one of any width, because masks have none
+        all_widths = ALL_WIDTHS if mask_settings.has_width else ()
         widths = widths.union(*options.widths or [all_widths])
     names = dict.fromkeys(kitti.locate(options.kitti, name)[1].name for name in options.sequences)
     planned = Study(
         options.kitti.absolute(),
         tuple(names or kitti.sequences(options.kitti)),
-        sources.named(options.sources, _mask_settings(options, has_labels), options.invert),
+        sources.named(options.sources, mask_settings, options.invert),
         tuple(sorted(widths)),
         options.controls,
         tuple(dict.fromkeys(options.estimator)),
         options.repetitions,
         options.frames,
         options.scale_gate,
-        {name: value for name, value in _odometry_settings(options).items() if name in OF_MASKED},
+        {"detector": detector} if (detector := _detector(options)) else {},
+        options.without_border,
     )
     planned.check()
     folder = options.folder.absolute()
@@ -181,13 +188,22 @@ def study(options: Any) -> int:
         warnings = []
         for sequence, masks in study.shown_masks(planned):
             warnings += _warn(_check_masks(sequence, masks))
-        outcome = planned.run(folder, options.jobs, options.dask)
+        workers = (options.jobs, options.dask)
+        if not any(sequence.has_truth for sequence in planned.opened):
+            worths = planned.worths(folder, *workers)
+            if worths is not None:  # otherwise the run below says that the ground truth is missing
+                file = study.write_worths(planned, worths, folder)
+                messages.summary(f"no ground truth, so no errors; worth of keypoints: {file}")
+                return 0
+        outcome = planned.run(folder, *workers)
+        planned = replace(planned, sequences=tuple(outcome.table["sequence"].unique()))
         runs = outcome.table[outcome.table["method"] == "baseline"].drop_duplicates("sequence")
         of_runs = [
             checks.of_run(run.sequence, run.frames, run.flagged) for run in runs.itertuples()
         ]
         warnings += outcome.warnings + _warn(chain(*of_runs))
-        page = study.write(planned, outcome.table, folder, warnings)
+        worths = planned.worths(folder, *workers)
+        page = study.write(planned, outcome.table, folder, warnings, worths)
     made = f"{len(outcome.table):,} runs, {outcome.failed_jobs:,} failed"
     messages.summary(f"{made}; open {page} in a browser", outcome.kept)
     return int(outcome.failed_jobs > 0)
@@ -239,17 +255,19 @@ def _record(result: Any, sequence: Any) -> dict[str, Any]:
     }
 
 
-def _odometry_settings(options: Any) -> dict[str, Any]:
-    """The settings of the odometry that options of their names and --spread give."""
-    from thesis_repro.odometry import OdometrySettings
+def _detector(options: Any) -> Any:
+    """The detector that --detector, --spread and --fill choose; None for the thesis's."""
+    from thesis_repro.odometry.estimators import DETECTORS
+    from thesis_repro.odometry.keypoints import filled, spread
 
-    given = {field.name: vars(options).get(field.name) for field in fields(OdometrySettings)}
-    settings = {name: value for name, value in given.items() if value is not None}
+    detector = DETECTORS[vars(options).get("detector", "shi-tomasi")]
     if options.spread:
-        if "max_keypoints" in settings:
-            raise InputError("--spread N, --max-keypoints N: give only one of them")
-        settings |= {"choice": "spread", "max_keypoints": options.spread}
-    return settings
+        if detector or vars(options).get("max_keypoints", 2000) != 2000:
+            raise InputError("--spread N: goes without --max-keypoints and --detector")
+        detector = spread(options.spread)
+    if options.fill:
+        detector = filled(options.fill, detector)
+    return detector
 
 
 def _sequence(options: Any) -> Any:
@@ -264,7 +282,10 @@ def _sequence(options: Any) -> Any:
         getattr(options, "truth", None),
         getattr(options, "calibration", None),
     )
-    return sequence.subset(options.frames)
+    sequence = sequence.subset(options.frames)
+    if vars(options).get("without_border"):
+        return sequence.without_border()
+    return sequence
 
 
 def _check_masks(sequence: Any, mask_sets: Iterable) -> list[str]:
@@ -334,17 +355,14 @@ def _masks(options: Any, sequence: Any) -> Any:
 
     settings = _mask_settings(options, options.labels)
     ready_made = vars(options).get("masks")
-    if bool(options.labels) != (options.dilation is not None or settings.keep == "static"):
+    if bool(options.labels) != (options.dilation is not None or not settings.has_width):
         raise InputError("--labels DIR, --dilation W: give both or neither")
     if options.labels and ready_made:
         raise InputError("--labels DIR, --masks DIR: give only one of them")
     if vars(options).get("invert") and not ready_made:
         raise InputError("--invert: needs --masks DIR")
     if options.labels:
-        width = options.dilation
-        if width is None:
-            width = 1  # masks of what cannot move have no width
-        return LabelMasks(options.labels, sequence, width, settings)
+        return LabelMasks(options.labels, sequence, options.dilation, settings)
     if ready_made:
         return MaskFolder(ready_made, sequence, options.invert)
     return None
@@ -365,6 +383,11 @@ def _check_outputs(options: Any, *inputs: Path | None) -> None:
         endings = OUTPUT_FILES[name][1]
         if endings and path.suffix.lower() not in endings:
             raise InputError(f"--{name} {path}: its name must end in {' or '.join(endings)}")
+        for other in list(outputs)[: list(outputs).index(name)]:
+            if path.resolve() == outputs[other].resolve():
+                raise InputError(
+                    f"--{other}, --{name}: both are {path}; give each a name of its own"
+                )
     for path in filter(None, [vars(options).get("folder"), *outputs.values()]):
         for folder in data:
             if path.resolve().is_relative_to(folder):
@@ -387,6 +410,7 @@ def _print(options: Any, record: Any, template: str, **values: Any) -> None:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command in the arguments (default: of this process), and return its exit status."""
-    options = build_parser(COMMANDS).parse_args(arguments)
+    arguments = sys.argv[1:] if arguments is None else arguments
+    options = build_parser(COMMANDS, arguments).parse_args(arguments)
     os.environ["MPLBACKEND"] = "agg"  # commands draw only into files
     return messages.run(lambda: options.function(options))

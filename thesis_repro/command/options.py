@@ -1,7 +1,7 @@
 """The options of the command line. cli.py has the commands."""
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from fractions import Fraction
 from importlib.metadata import version
 from pathlib import Path
@@ -42,6 +42,11 @@ SHARED: dict[str, dict[str, Any]] = {
         metavar="METRES",
         help="a shorter step leaves the pose as it is; 0 for slow cameras and many frames a second (0.1)",
     ),
+    "--without-border": dict(
+        action="store_true",
+        help="no keypoints in and near parts that are black in all frames, as undistortion leaves them (transparent "
+        "parts never have any)",
+    ),
     "--spread": dict(
         type=settings.positive_whole_number,
         metavar="N",
@@ -56,12 +61,59 @@ SHARED: dict[str, dict[str, Any]] = {
 }
 SEQUENCE = ("--kitti", "--sequence", "--camera", "--frames")
 DILATION = dict(type=int, metavar="W", help="dilation width, in pixels, of masks from label maps")
-MASK_OPTIONS: dict[str, dict[str, Any]] = {
-    "--boundaries": dict(
-        metavar="canny|exact",
+
+
+# Options whose names stand in a table, which takes a second to import
+
+
+def _boundaries() -> dict[str, Any]:
+    from thesis_repro.masks import BOUNDARIES
+
+    return dict(
+        metavar="|".join(BOUNDARIES),
         default="canny",
         help="edges by Canny or all changes of class (canny)",
-    ),
+    )
+
+
+def _keep() -> dict[str, Any]:
+    from thesis_repro.masks import KINDS
+
+    where = ", ".join(kind.help for kind in KINDS.values())
+    return dict(
+        metavar="|".join(KINDS), default="boundaries", help=f"keypoints {where} (boundaries)"
+    )
+
+
+def _estimator() -> dict[str, Any]:
+    from thesis_repro.odometry.estimators import ESTIMATORS
+
+    return dict(
+        choices=tuple(ESTIMATORS),
+        default="thesis",
+        help="motion by a vote of all matched points (PySLAM) or of RANSAC's inliers, or by least squares (thesis)",
+    )
+
+
+def _compared_estimators() -> dict[str, Any]:
+    from thesis_repro.study.jobs import ESTIMATORS
+
+    names = list(ESTIMATORS)
+    return dict(nargs="+", choices=names, default=names, help="one or several (all)")
+
+
+def _detector() -> dict[str, Any]:
+    from thesis_repro.odometry.estimators import DETECTORS
+
+    return dict(
+        choices=tuple(DETECTORS),
+        default="shi-tomasi",
+        help="keypoint detector; the tracker stays the same (shi-tomasi)",
+    )
+
+
+MASK_OPTIONS: dict[str, dict[str, Any] | Callable] = {
+    "--boundaries": _boundaries,
     "--symmetric": dict(
         action="store_true", help="centre masks on boundaries; the thesis's are half a pixel off"
     ),
@@ -79,12 +131,7 @@ MASK_OPTIONS: dict[str, dict[str, Any]] = {
         metavar="PIXELS",
         help="no keypoints on people and vehicles, nor within PIXELS of them (0)",
     ),
-    "--keep": dict(
-        metavar="boundaries|static|inverse|static-boundaries",
-        default="boundaries",
-        help="keypoints on boundaries, on all but movable things, on all but boundaries, or on boundaries "
-        "between static classes (boundaries)",
-    ),
+    "--keep": _keep,
     "--ids": dict(
         metavar="labels|train|colors|FILE",
         default="labels",
@@ -123,8 +170,8 @@ def _name_and_folder(text: str) -> tuple[str | None, Path]:
     return name, Path(folder).expanduser()  # a shell replaces "~" only at the start of a word
 
 
-# the arguments of `add_argument` for each option of each command
-COMMANDS: dict[str, dict[str, dict[str, Any]]] = {
+# the arguments of `add_argument` for each option of each command, or a function that returns them
+COMMANDS: dict[str, dict[str, dict[str, Any] | Callable]] = {
     "synthesize": {
         "out": dict(
             type=Path, metavar="OUT", help="new folder, or one in which this command was stopped"
@@ -179,7 +226,7 @@ COMMANDS: dict[str, dict[str, dict[str, Any]]] = {
     "odometry": {
         **_shared(*SEQUENCE),
         **MASK_OPTIONS,
-        **_shared("--invert", "--scale-gate", "--spread", "--fill"),
+        **_shared("--invert", "--scale-gate", "--without-border", "--spread", "--fill"),
         "--truth": dict(
             type=Path,
             metavar="FILE",
@@ -188,8 +235,8 @@ COMMANDS: dict[str, dict[str, dict[str, Any]]] = {
         "--calibration": dict(
             type=Path,
             metavar="FILE",
-            help="camera with distortion, which is taken out: fx fy cx cy k1 k2 p1 p2, or YAML of OpenCV, "
-            "ORB-SLAM or Kalibr (calib.txt, without distortion)",
+            help="camera with distortion, which is taken out: fx fy cx cy k1 k2 p1 p2 (the first four are "
+            "enough), or YAML of OpenCV, ROS, EuRoC, Kalibr or ORB-SLAM (calib.txt, without distortion)",
         ),
         "--speed": dict(
             type=float, metavar="M_PER_S", help="speed, if there is no ground truth (1 m a frame)"
@@ -208,16 +255,13 @@ COMMANDS: dict[str, dict[str, dict[str, Any]]] = {
             help="a label map for each frame, or a folder of them for each sequence; needs --dilation",
         ),
         "--dilation": DILATION,
-        "--estimator": dict(
-            metavar="thesis|inliers|refined",
-            help="motion by a vote of all matched points (PySLAM) or of RANSAC's inliers, or by least squares (thesis)",
-        ),
-        "--detector": dict(
-            metavar="shi-tomasi|orb",
-            help="keypoint detector; the tracker stays the same (shi-tomasi)",
-        ),
+        "--estimator": _estimator,
+        "--detector": _detector,
         "--max-keypoints": dict(
-            type=int, metavar="N", help="maximum number of keypoints in a frame (2000)"
+            type=int,
+            default=2000,
+            metavar="N",
+            help="maximum number of keypoints in a frame (2000)",
         ),
         "--output": dict(
             type=Path, metavar="POSES.txt", help="write the estimated poses in KITTI format"
@@ -239,7 +283,7 @@ COMMANDS: dict[str, dict[str, dict[str, Any]]] = {
             metavar="NN",
             help="sequences to run (all in ROOT)",
         ),
-        **_shared("--frames", "--invert", "--scale-gate", "--spread", "--fill"),
+        **_shared("--frames", "--invert", "--scale-gate", "--without-border", "--spread", "--fill"),
         **MASK_OPTIONS,
         **_shared("--output"),
         "--labels": _source(
@@ -256,8 +300,8 @@ COMMANDS: dict[str, dict[str, dict[str, Any]]] = {
         "--keypoints": _source(
             "keypoints",
             "[NAME=]FILE.py",
-            "Python file, which is executed, with your function detect(frame, settings, mask) or "
-            "track(previous, current, points, settings)",
+            "Python file, which is executed, with your function detect(frame, settings, mask), "
+            "track(previous, current, points, settings), or others of the odometry's four calls",
         ),
         "--paths": _source(
             "paths",
@@ -284,12 +328,7 @@ COMMANDS: dict[str, dict[str, dict[str, Any]]] = {
             metavar="N",
             help="shuffles of the matched points for each run (5)",
         ),
-        "--estimator": dict(
-            nargs="+",
-            choices=("thesis", "refined"),
-            default=["thesis", "refined"],
-            help="one or both (both)",
-        ),
+        "--estimator": _compared_estimators,
         "--jobs": dict(
             type=settings.positive_whole_number,
             default=settings.cores(),
@@ -304,8 +343,14 @@ COMMANDS: dict[str, dict[str, dict[str, Any]]] = {
 }
 
 
-def build_parser(functions: dict[str, Callable]) -> argparse.ArgumentParser:
-    """Return the parser. functions: of the commands, by name; their docstrings are the help."""
+def build_parser(
+    functions: dict[str, Callable], arguments: Collection[str] | None = None
+) -> argparse.ArgumentParser:
+    """Return the parser of arguments. functions: of the commands, by name.
+
+    Their docstrings are the help. Only the command in the arguments gets its options; without
+    arguments, all do.
+    """
     parser = argparse.ArgumentParser(
         prog="thesis-repro",
         description="Keypoint masks from semantic segmentation for monocular visual odometry. "
@@ -329,9 +374,11 @@ def build_parser(functions: dict[str, Callable]) -> argparse.ArgumentParser:
         )
         sub.set_defaults(function=function)
         mask_options = sub.add_argument_group("how masks are made from label maps")
-        for option, arguments in COMMANDS[name].items():
+        if arguments is not None and name not in arguments:
+            continue
+        for option, how in COMMANDS[name].items():
             group: Any = sub
             if option in MASK_OPTIONS:
                 group = mask_options
-            group.add_argument(option, **arguments)
+            group.add_argument(option, **(how if isinstance(how, dict) else how()))
     return parser

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from copy import copy
 from decimal import Decimal
 from functools import cache, cached_property
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -52,6 +53,10 @@ CALIBRATION_KEYS = {
 TRUE_LABELS = "labels_0"  # exact label maps beside image_0, which only the embedded world has
 DECIMAL = re.compile(r"\d+\.\d+")  # names of frames that may be seconds
 MIN_FRAME_SIDE = 16  # pixels; keypoints cannot be tracked in smaller frames
+# Pixels near a border where keypoints are left out: half a window of the tracker, which would see
+# the border's edge
+BORDER_MARGIN = 10
+BORDER_SAMPLES, BLACK = 12, 8  # frames, and the largest gray value of a border
 FRAME_TIME = 0.1  # seconds between frames, assumed for a sequence without times.txt
 
 
@@ -128,6 +133,11 @@ def images_of(folder: str | Path, camera: str | None = None) -> Path:
     for name in names:
         if (folder / name / inner).is_dir():
             return folder / name / inner
+    if folder.is_file():
+        raise InputError(
+            f"{folder}: is a file; a sequence is a folder of frames (docs/own-masks.md says how to write "
+            "those of a video)"
+        )
     if camera is not None or not folder.is_dir():
         raise InputError(f"{folder / (camera or '')}: no such folder; it must hold the frames")
     return folder
@@ -136,18 +146,49 @@ def images_of(folder: str | Path, camera: str | None = None) -> Path:
 def frames_in(folder: Path) -> list[Path]:
     """Images of a folder in the order of their numbers.
 
-    Names such as 0.15 and 0.2 are ordered by value if they differ in their number of decimals.
+    Names such as 0.15 and 0.2, which differ in their number of decimals, are decimal numbers, or
+    seconds and nanoseconds without leading zeros. Raises InputError if they may be both, in
+    different orders.
     """
     paths = images(folder)
-    if not all(DECIMAL.fullmatch(path.stem) for path in paths):
+    parts = [path.stem.split(".") for path in paths if DECIMAL.fullmatch(path.stem)]
+    fractions = [fraction for _, fraction in parts]
+    if len(parts) < len(paths) or len(set(map(len, fractions))) < 2:
         return paths
-    if len({len(path.stem.partition(".")[2]) for path in paths}) > 1:
-        paths.sort(key=lambda path: Decimal(path.stem))
-        _say_once(
-            f"{folder}: frames are in the order of their names as decimal numbers, {paths[0].stem} to "
-            f"{paths[-1].stem}; if nanoseconds follow the dot, rename them to nine digits each"
-        )
-    return paths
+    by_value = sorted(paths, key=lambda path: Decimal(path.stem))
+    by_nanoseconds = sorted(paths, key=lambda path: _nanoseconds(path.stem))
+    form, ordered = "decimal numbers", by_value
+    if _may_be_nanoseconds(by_nanoseconds, fractions):
+        # decimals without their last zeros do not end with a zero
+        if any(len(fraction) > 1 and fraction.endswith("0") for fraction in fractions):
+            form, ordered = "seconds and nanoseconds", by_nanoseconds
+        elif by_value != by_nanoseconds:
+            raise InputError(
+                f"{folder}: {paths[0].name} and the like may be decimal numbers, or seconds and nanoseconds, "
+                "in different orders; rename the frames so that all have as many digits after the dot"
+            )
+    _say_once(
+        f"{folder}: frames are in the order of their names as {form}, {ordered[0].stem} to "
+        f"{ordered[-1].stem}"
+    )
+    return ordered
+
+
+def _nanoseconds(stem: str) -> int:
+    seconds, fraction = stem.split(".")
+    return int(seconds) * 10**9 + int(fraction)
+
+
+def _may_be_nanoseconds(ordered: list[Path], fractions: list[str]) -> bool:
+    """Whether names may be seconds and nanoseconds without leading zeros.
+
+    ordered: the frames in the order of these times, of which no camera makes more than 100,000 a
+    second.
+    """
+    times = [_nanoseconds(path.stem) for path in ordered]
+    is_slow = all(later - time >= 10_000 for time, later in pairwise(times))
+    has_no_zeros = not any(len(text) > 1 and text.startswith("0") for text in fractions)
+    return is_slow and has_no_zeros and max(map(len, fractions)) <= 9
 
 
 @cache
@@ -193,6 +234,7 @@ class Sequence:
         if truth is not None:
             self.poses_path = Path(truth)
         self.name, self.speed = self.folder.name, speed
+        self.border: np.ndarray | None = None  # see `without_border`
         frame_folder = images_of(self.folder, camera)
         self.frame_paths = frames_in(frame_folder)
         if not self.frame_paths:
@@ -203,10 +245,11 @@ class Sequence:
             camera_folder = frame_folder.parent
             self.calibration_path = kitti_raw.calibration(self.folder)
             self.times_path = camera_folder / kitti_raw.TIMES
-        self.distortion = np.empty(0)
+        self.distortion, self.stated_size = np.empty(0), None
         if calibration is not None:
             self.calibration_path = Path(calibration)
-            self.intrinsics, self.distortion = cameras.read_camera(calibration)
+            camera_of_file = cameras.read_camera(calibration)
+            self.intrinsics, self.distortion, self.stated_size = camera_of_file
         else:
             self.intrinsics = read_intrinsics(self.calibration_path, camera_folder.name)
         self.has_times = self.times_path.exists()
@@ -253,6 +296,8 @@ class Sequence:
         self.times = self.times[first:end]
 
     def _check_speed(self, speed: float, has_times: bool) -> None:
+        if not 0 < speed < np.inf:
+            raise InputError(f"speed {speed:g}: must be a number of metres a second, above 0")
         if self.has_truth:
             raise InputError(
                 f"speed {speed}: leave it out; {self.poses_path} has the true step lengths"
@@ -308,7 +353,8 @@ class Sequence:
     def size(self) -> tuple[int, int]:
         """Size (height, width) of the first frame. Raises InputError as `check_camera` does."""
         size = self._read(self.frame_paths[0]).shape
-        check_camera(self.calibration_path, self.intrinsics, self.frame_paths[0], size)
+        first = self.frame_paths[0]
+        check_camera(self.calibration_path, self.intrinsics, first, size, self.stated_size)
         return size
 
     def frame(self, index: int) -> np.ndarray:
@@ -353,6 +399,43 @@ class Sequence:
         """Yield the frames in order."""
         for index in range(len(self)):
             yield self.frame(index)
+
+    def visible(self, index: int) -> np.ndarray | None:
+        """Where keypoints may lie in frame `index`, (height, width) uint8: 255, elsewhere 0.
+
+        They lie neither in transparent parts, nor outside of what the camera saw if its distortion
+        is taken out, nor in the border (`without_border`), nor within BORDER_MARGIN pixels of
+        these. None: everywhere.
+        """
+        hidden = np.zeros(self.size, bool) if self.border is None else self.border.copy()
+        if self._has_alpha:
+            pixels = cv2.imread(str(self.frame_paths[index]), cv2.IMREAD_UNCHANGED)
+            if pixels.ndim == 3 and pixels.shape[2] == 4:
+                hidden |= self.undistorted((pixels[..., 3] == 0).astype(np.uint8)) > 0
+        if self.distortion.any():
+            hidden |= self.undistorted(np.full(self.size, 255, np.uint8)) == 0
+        if not hidden.any():
+            return None
+        margin = np.ones([2 * BORDER_MARGIN + 1] * 2, np.uint8)
+        return 255 - cv2.dilate(hidden * np.uint8(255), margin)
+
+    @cached_property
+    def _has_alpha(self) -> bool:
+        pixels = cv2.imread(str(self.frame_paths[0]), cv2.IMREAD_UNCHANGED)
+        return pixels is not None and pixels.ndim == 3 and pixels.shape[2] == 4
+
+    def without_border(self) -> "Sequence":
+        """Copy without keypoints in parts that are black in all frames, nor close to them.
+
+        Undistortion leaves such borders. Raises InputError if there are none.
+        """
+        sample = np.unique(np.linspace(0, len(self) - 1, BORDER_SAMPLES).astype(int))
+        border = np.max([self.frame(index) for index in sample], axis=0) <= BLACK
+        if not border.any() or border.all():
+            raise InputError(f"{self.folder}: frames have no black border; do not leave it out")
+        bordered = copy(self)
+        bordered.border = border
+        return bordered
 
     def subset(self, count: int | None) -> "Sequence":
         """Copy of the sequence with its first `count` frames; None for all frames."""
@@ -437,11 +520,15 @@ def is_camera_matrix(matrix: np.ndarray) -> bool:
 
 
 def check_camera(
-    path: Path | str, intrinsics: np.ndarray, frame: Path | str, size: tuple[int, int]
+    path: Path | str,
+    intrinsics: np.ndarray,
+    frame: Path | str,
+    size: tuple[int, int],
+    stated: tuple[int, int] | None = None,
 ) -> None:
-    """Raise InputError if frames are too small or do not fit the camera matrix.
+    """Raise InputError if frames are too small or do not fit the camera.
 
-    size: height and width.
+    size: height and width. stated: those that the camera's file says its frames have.
     """
     height, width = size
     if min(size) < MIN_FRAME_SIDE:
@@ -449,10 +536,11 @@ def check_camera(
             f"{frame}: {width}x{height} pixels; each side needs {MIN_FRAME_SIDE} or more"
         )
     (fx, _, u), (_, fy, v), _ = intrinsics
-    of_kitti = KNOWN_SIZES.get((round(fx, 3), round(u, 3)))
-    if of_kitti and of_kitti != (width, height):
+    if stated is None:
+        stated = KNOWN_SIZES.get((round(fx, 3), round(u, 3)), (width, height))[::-1]
+    if stated != size:
         raise InputError(
-            f"{path}: is KITTI's for frames of {of_kitti[0]}x{of_kitti[1]} pixels, but these have "
+            f"{path}: is for frames of {stated[1]}x{stated[0]} pixels, but {frame} has "
             f"{width}x{height}; scale or shift focal lengths and centre as the frames were"
         )
     center_fits = 0 <= u <= width and 0 <= v <= height

@@ -10,6 +10,7 @@ means that the pose does not change:
 
 - black, overexposed or without contrast: "flat frame", skipped. The next motion is measured from
   the last frame before it, over the sum of the step lengths
+- equal to the frame before, as in a video at twice its rate: "equal frame", skipped likewise
 - no new keypoint (mask all zero, say): "no keypoints", the tracked points are tracked further
 - no point to track: "no points", kept; starts again from this frame's keypoints
 - too few correspondences: "fewer than five correspondences", kept
@@ -20,7 +21,7 @@ means that the pose does not change:
 - step shorter than the gate (PySLAM's rule): "stationary", kept
 - rotation larger than a car's: "too large a turn", the pose moves, as in PySLAM
 
-With estimator="refined" there are two more flags, and the pose is always moved (see
+With the refined estimator there are two more flags, and the pose is always moved (see
 refined.motion_prior):
 
 - motion inconsistent with the previous step: "ambiguous motion", the best consistent motion if

@@ -1,48 +1,50 @@
-"""The estimators: how a step's motion follows from its essential matrix, which allows four."""
+"""The names of estimators and detectors, in tables and on the command line.
 
-from importlib import import_module
+Settings take the objects: OdometrySettings(estimator=refined). A new estimator is a class with a
+method `motion` and, if it wants no RANSAC, its own `search` (types.Estimator), and an entry here.
+"""
+
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from thesis_repro.odometry.types import Matches, Motion, motion_of_vote
+from thesis_repro.odometry import keypoints
+from thesis_repro.odometry.types import Estimator, Matches, Motion, motion_of_vote
 
 
-class Entry(NamedTuple):
-    """An estimator that settings can name."""
-
-    title: str  # in tables and figures
-    module: str  # imported when a setting asks for it
-    class_name: str  # has `motion`, see odometry.Estimator
-    is_compared: bool = True  # in studies; otherwise only the ablations run it
-
-
-# A new estimator is an entry here. OdometrySettings describes them.
-ESTIMATORS = {
-    "thesis": Entry("thesis's estimator", "thesis_repro.odometry.odometry", "VoteOfAll"),
-    "inliers": Entry(
-        "vote of the inliers", "thesis_repro.odometry.estimators", "VoteOfInliers", False
-    ),
-    "refined": Entry("refined estimator", "thesis_repro.odometry.refined", "RefinedEstimator"),
-}
-
-
-def new_estimator(name: str, calls: Any) -> Any:
-    """Return a new object of an estimator. calls: see odometry.Calls."""
-    entry = ESTIMATORS[name]
-    return getattr(import_module(entry.module), entry.class_name)(calls)
-
-
-class VoteOfInliers:
+class VoteOfInliers(NamedTuple):
     """The motion that most inliers vote for."""
 
-    def __init__(self, calls: Any):
-        self.calls = calls
+    calls: Any
 
     def motion(self, essential: np.ndarray, matches: Matches, scale: float, moves: bool) -> Motion:
-        """Return the motion of a step (see odometry.Estimator)."""
+        """Return the motion of a step (see types.Estimator)."""
         inliers = matches.inliers
         voted = self.calls.recover_pose(
             essential, matches.current[inliers], matches.previous[inliers]
         )
         return motion_of_vote(*voted)
+
+
+def refined(calls: Any) -> Estimator:
+    """Return a new refined estimator (odometry.refined)."""
+    from thesis_repro.odometry.refined import RefinedEstimator  # compiles functions
+
+    return RefinedEstimator()
+
+
+class Entry(NamedTuple):
+    """An estimator by name."""
+
+    title: str  # in tables and figures
+    make: Callable | None  # as in settings: from the odometry's calls to an estimator
+    is_compared: bool = True  # in studies; otherwise only the ablations run it
+
+
+ESTIMATORS = {
+    "thesis": Entry("thesis's estimator", None),
+    "inliers": Entry("vote of the inliers", VoteOfInliers, is_compared=False),
+    "refined": Entry("refined estimator", refined),
+}
+DETECTORS: dict[str, Callable | None] = {"shi-tomasi": None, "orb": keypoints.orb}

@@ -1,107 +1,132 @@
-"""Choices of keypoints beside the thesis's: spread ones, filled masks, ORB's, filtered ones."""
+"""Detectors beside the thesis's, for settings: OdometrySettings(detector=spread(200)).
+
+A detector is a function of a frame (height, width), settings and a mask, (height, width) or None,
+which allows keypoints where it is not 0. It returns (N, 2) float32 pixels, strongest first. Those
+with a number are small objects, equal if their numbers are.
+"""
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
-from thesis_repro.odometry import odometry
+from thesis_repro.errors import InputError
+from thesis_repro.odometry import corners
 from thesis_repro.odometry.settings import THESIS, OdometrySettings
 
 FIELDS = (5, 16)  # rows and columns into which a frame is divided to fill a mask
 
 
-def detect(
-    frame: np.ndarray,
-    settings: OdometrySettings = THESIS,
-    mask: np.ndarray | None = None,
-    shi_tomasi: Callable = odometry.detect,
+def orb(
+    frame: np.ndarray, settings: OdometrySettings = THESIS, mask: np.ndarray | None = None
 ) -> np.ndarray:
-    """Find keypoints of a frame (height, width): (N, 2) float32 pixels, strongest first.
-
-    mask: (height, width), allows keypoints where it is not 0. With settings.mask_mode "detect" the
-    detector searches inside the mask only and returns up to max_keypoints. With "filter" it
-    searches the whole frame, and keypoints outside the mask are dropped.
-    shi_tomasi: what finds Shi-Tomasi keypoints, with the arguments of `odometry.detect`.
-    """
-    inside = mask if settings.mask_mode == "detect" else None
-    if settings.detector == "orb":
-        points = _detect_orb(frame, settings, inside)
-    elif settings.choice == "spread":
-        points = spread(frame, settings, inside, shi_tomasi)
-    else:
-        points = shi_tomasi(frame, settings, inside)
-    if mask is None:
-        return points
-    if settings.mask_mode == "filter":
-        columns, rows = np.rint(points).astype(int).T
-        points = points[mask[rows, columns] > 0]
-    if settings.fill:
-        all_strongest = replace(settings, choice="strongest", max_keypoints=0)
-        everywhere = shi_tomasi(frame, all_strongest, None)
-        points = filled(points, everywhere, frame.shape, settings)
-    return points
+    """Find max_keypoints of ORB. They are still tracked by Lucas-Kanade."""
+    points = cv2.KeyPoint_convert(cv2.ORB_create(settings.max_keypoints).detect(frame, mask))
+    return np.reshape(points, (-1, 2)).astype(np.float32, copy=False)
 
 
-def spread(
-    frame: np.ndarray,
-    settings: OdometrySettings,
-    inside: np.ndarray | None,
-    shi_tomasi: Callable,
-) -> np.ndarray:
-    """The strongest keypoints that are as far apart as their number allows.
+@dataclass(frozen=True)
+class spread:  # it is called like a function
+    """The `number` strongest keypoints that are as far apart as their number allows.
 
     The field calls it adaptive non-maximal suppression. The distance, whole pixels, is found by
-    bisection in each frame: the largest one that leaves max_keypoints.
+    bisection in each frame: the largest one that leaves `number`.
     """
-    chosen = shi_tomasi(frame, settings, inside)
-    near, far = settings.min_distance, max(frame.shape)
-    while len(chosen) == settings.max_keypoints and far - near > 1:
-        middle = int((near + far) / 2)
-        points = shi_tomasi(frame, replace(settings, min_distance=middle), inside)
-        if len(points) == settings.max_keypoints:
-            near, chosen = middle, points
-        else:
-            far = middle
-    return chosen
+
+    number: int
+
+    def __post_init__(self) -> None:
+        _check_number(self.number)
+
+    def __call__(
+        self,
+        frame: np.ndarray,
+        settings: OdometrySettings = THESIS,
+        mask: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """Find the keypoints of a frame."""
+        frame = _unchanging(frame)
+        near, far = settings.min_distance, max(frame.shape)
+        settings = replace(settings, max_keypoints=self.number)
+        chosen = corners.detect(frame, settings, mask)
+        while len(chosen) == self.number and far - near > 1:
+            middle = int((near + far) / 2)
+            points = corners.detect(frame, replace(settings, min_distance=middle), mask)
+            if len(points) == self.number:
+                near, chosen = middle, points
+            else:
+                far = middle
+        return chosen
 
 
-def filled(
-    points: np.ndarray,
-    everywhere: np.ndarray,
-    size: tuple[int, ...],
-    settings: OdometrySettings,
+@dataclass(frozen=True)
+class filled:
+    """Keypoints inside the mask, and more where the mask leaves few.
+
+    Of 16 x 5 fields of the frame (the field calls it bucketing), each with fewer than `number`
+    keypoints gets its strongest ones that are min_distance away from them. detector: finds those
+    inside the mask; None: the thesis's.
+    """
+
+    number: int
+    detector: Callable | None = None
+
+    def __post_init__(self) -> None:
+        _check_number(self.number)
+
+    def __call__(
+        self,
+        frame: np.ndarray,
+        settings: OdometrySettings = THESIS,
+        mask: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """Find the keypoints of a frame."""
+        frame = _unchanging(frame)
+        points = (self.detector or corners.detect)(frame, settings, mask)
+        if mask is None:
+            return points
+        everywhere = corners.detect(frame, replace(settings, max_keypoints=0))
+        chosen = list(points)
+        fields_of_points = _fields(points, frame.shape)
+        fields_of_others = _fields(everywhere, frame.shape)
+        for field in range(FIELDS[0] * FIELDS[1]):
+            taken = list(points[fields_of_points == field])
+            for candidate in everywhere[fields_of_others == field]:
+                if len(taken) >= self.number:
+                    break
+                distances = np.linalg.norm(np.reshape(taken, (-1, 2)) - candidate, axis=1)
+                if (distances >= settings.min_distance).all():
+                    taken.append(candidate)
+                    chosen.append(candidate)
+        return np.reshape(chosen, (-1, 2)).astype(np.float32)
+
+
+def filtered(
+    frame: np.ndarray, settings: OdometrySettings = THESIS, mask: np.ndarray | None = None
 ) -> np.ndarray:
-    """Points of a mask (N, 2), and more in the fields of the frame where the mask leaves few.
+    """Find the thesis's keypoints in the whole frame, and drop those outside the mask."""
+    points = corners.detect(frame, settings)
+    if mask is None:
+        return points
+    columns, rows = np.rint(points).astype(int).T
+    return points[mask[rows, columns] > 0]
 
-    A field with fewer than settings.fill points gets its strongest keypoints of `everywhere` (M, 2)
-    that are min_distance away from its points. The field calls such a division bucketing.
-    """
-    chosen = list(points)
-    fields_of_points = _fields(points, size)
-    fields_of_others = _fields(everywhere, size)
-    for field in range(FIELDS[0] * FIELDS[1]):
-        taken = list(points[fields_of_points == field])
-        for candidate in everywhere[fields_of_others == field]:
-            if len(taken) >= settings.fill:
-                break
-            distances = np.linalg.norm(np.reshape(taken, (-1, 2)) - candidate, axis=1)
-            if (distances >= settings.min_distance).all():
-                taken.append(candidate)
-                chosen.append(candidate)
-    return np.reshape(chosen, (-1, 2)).astype(np.float32)
+
+def _check_number(number: int) -> None:
+    if not isinstance(number, int | np.integer) or number < 1:
+        raise InputError(f"number of keypoints: {number!r} is not a whole number of 1 or more")
+
+
+def _unchanging(frame: np.ndarray) -> np.ndarray:
+    """A copy that nobody can change, unless the frame is one, see `corners.detect`."""
+    if frame.flags.writeable:
+        frame = frame.copy()
+        frame.setflags(write=False)
+    return frame
 
 
 def _fields(points: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
     """Number of the field in which each of N points (N, 2) lies, (N,)."""
     columns, rows = (points // (size[1] / FIELDS[1], size[0] / FIELDS[0])).astype(int).T
     return rows * FIELDS[1] + columns
-
-
-def _detect_orb(
-    frame: np.ndarray, settings: OdometrySettings, inside: np.ndarray | None
-) -> np.ndarray:
-    found = cv2.ORB_create(settings.max_keypoints).detect(frame, inside)
-    points = cv2.KeyPoint_convert(found)
-    return np.reshape(points, (-1, 2)).astype(np.float32, copy=False)

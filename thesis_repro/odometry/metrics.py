@@ -190,7 +190,7 @@ def step_errors(estimated: np.ndarray, true: np.ndarray) -> dict[str, float]:
     rotation_error = angles(np.linalg.inv(true_steps) @ steps)
     turn = angles(true_steps)
     impossible = (angles(steps) > MAX_TURN) & (rotation_error > FAILED_ROTATION)
-    directed = np.linalg.norm(true_steps[:, :3, 3], axis=1) >= MIN_DIRECTED_STEP
+    directed = _length(true_steps) >= MIN_DIRECTED_STEP
     heading = _directions(steps[directed, :3, 3])
     true_heading = _directions(true_steps[directed, :3, 3])
     cosine = np.clip((heading * true_heading).sum(axis=1), -1, 1)
@@ -209,6 +209,62 @@ def step_errors(estimated: np.ndarray, true: np.ndarray) -> dict[str, float]:
         "steps": int(directed.sum()),
         "lost": int(impossible.any()),
     }
+
+
+FOREIGN_DIRECTION, EXPLAINED = 45.0, 15.0  # degrees; 5.9 is the largest of healthy recorded runs
+MIN_STEPS = 10  # of a path, to say what its true poses are
+TRUTH_KINDS = {
+    "inverse": "are world-to-camera poses; invert each of them",
+    "reversed": "are in reverse order",
+    "turned": "are those of a body with other axes; the camera's are x right, y down, z forward",
+    "": "do not fit these frames, or the odometry fails on them",
+}
+
+
+def foreign_truth(estimated: np.ndarray, true: np.ndarray) -> str:
+    """Return what is wrong with true poses that cannot be those of the camera, or an empty text.
+
+    estimated, true: (n, 4, 4) each. No working odometry is off by FOREIGN_DIRECTION degrees in the
+    median direction of its steps. The text names the one of TRUTH_KINDS that brings the median
+    below EXPLAINED. Only steps of MIN_DIRECTED_STEP or more that moved the estimate count.
+    """
+    angle = _direction_error(estimated, true)
+    if not angle > FOREIGN_DIRECTION:  # NaN for too few steps
+        return ""
+    errors = {
+        "inverse": _direction_error(estimated, np.linalg.inv(true)),
+        "reversed": _direction_error(estimated, true[::-1]),
+    }
+    kind = min(errors, key=lambda name: errors[name])
+    if not errors[kind] < EXPLAINED:
+        kind = "turned" if _direction_error(estimated, true, turned=True) < EXPLAINED else ""
+    return (
+        f"true steps point {angle:.0f} degrees (median) away from the estimated ones, so these poses "
+        f"most likely {TRUTH_KINDS[kind]}"
+    )
+
+
+def _direction_error(estimated: np.ndarray, true: np.ndarray, turned: bool = False) -> float:
+    """Median angle, degrees, between the estimated and true directions of steps; NaN for few steps.
+
+    turned: after the one rotation that fits best.
+    """
+    steps = np.linalg.inv(estimated[:-1]) @ estimated[1:]
+    true_steps = np.linalg.inv(true[:-1]) @ true[1:]
+    counts = (_length(true_steps) >= MIN_DIRECTED_STEP) & (_length(steps) > 0)
+    if counts.sum() < MIN_STEPS:
+        return np.nan
+    heading = _directions(steps[counts, :3, 3])
+    true_heading = _directions(true_steps[counts, :3, 3])
+    if turned:
+        true_heading = Rotation.align_vectors(heading, true_heading)[0].apply(true_heading)
+    cosine = np.clip((heading * true_heading).sum(axis=1), -1, 1)
+    return float(np.degrees(np.median(np.arccos(cosine))))
+
+
+def _length(steps: np.ndarray) -> np.ndarray:
+    """Lengths of steps (n, 4, 4), metres."""
+    return np.linalg.norm(steps[:, :3, 3], axis=1)
 
 
 def _directions(shifts: np.ndarray) -> np.ndarray:

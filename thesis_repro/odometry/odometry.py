@@ -18,7 +18,6 @@ from thesis_repro.odometry.types import NO_POINTS, Matches, Motion, Step
 PROBABILITY = 0.999  # that RANSAC has tried a sample without wrong matches
 TERMINATION = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 0.01)  # of the tracker
 MIN_MATCHES = 5  # for an essential matrix
-MIN_CONTRAST = 4.0  # standard deviation in gray levels; real frames have more than 50
 MAX_TURN = 6.0  # degrees a frame; KITTI's car turns by at most 4.8
 STATIONARY = "stationary"  # flag of a step that is shorter than the gate
 
@@ -146,13 +145,13 @@ class Odometry:
         need("settings", settings, OdometrySettings)
         self.intrinsics = types.camera_matrix(intrinsics)
         self.settings = settings
-        self.calls = calls or OPENCV._replace(detect=settings.detect_function())
-        self.estimator: types.Estimator = settings.new_estimator(self.calls)
+        self.calls = calls or OPENCV._replace(detect=settings.detector or detect)
+        self.estimator: types.Estimator = (settings.estimator or VoteOfAll)(self.calls)
         self.pose = types.start_pose(start)
         self.count = 0  # of frames so far
         self.previous: np.ndarray | None = None  # the frame in which self.points lie
         self.points = NO_POINTS
-        self.skipped_metres = 0.0  # moved during flat frames
+        self.skipped_metres = 0.0  # moved during frames that were skipped
 
     def step(self, frame: Any, scale: Any = 0.0, mask: Any = None) -> Step:
         """Take the next frame. Returns a Step.
@@ -165,8 +164,8 @@ class Odometry:
         mask = types.allowed_pixels(mask, self.count, frame)
         step = Step(self.count, types.step_length(scale, self.count) + self.skipped_metres)
         self.count += 1
-        if frame[::8, ::8].std() < MIN_CONTRAST:
-            step.flags.append("flat frame")
+        step.flags += types.reasons_to_skip(frame, self.previous)
+        if step.flags:
             self.skipped_metres = step.scale
         else:
             self.skipped_metres = 0.0
@@ -201,9 +200,8 @@ class Odometry:
             step.flags.append("fewer than five correspondences")
             return
         with step.timed("essential"):
-            matrix, inliers = self.calls.find_essential_matrix(
-                current[order], previous[order], threshold
-            )
+            search = getattr(self.estimator, "search", self.calls.find_essential_matrix)
+            matrix, inliers = search(current[order], previous[order], threshold)
         if matrix is None or not np.isfinite(matrix).all():
             step.flags.append("no essential matrix")
             return

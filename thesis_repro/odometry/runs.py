@@ -10,9 +10,9 @@ import pandas as pd
 
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
-from thesis_repro.odometry.odometry import PROBABILITY, STATIONARY, Calls, Odometry
+from thesis_repro.odometry.odometry import PROBABILITY, STATIONARY, Calls, Odometry, detect
 from thesis_repro.odometry.settings import THESIS, OdometrySettings
-from thesis_repro.odometry.types import FRAME_COLUMNS, ROTATION_COLUMNS, TIMED_PARTS
+from thesis_repro.odometry.types import EQUAL, FRAME_COLUMNS, ROTATION_COLUMNS, TIMED_PARTS
 from thesis_repro.running import messages
 from thesis_repro.running.files import progress
 
@@ -53,7 +53,7 @@ class Result:
 
     @property
     def failed_steps(self) -> int:
-        """Number of frames with a flag other than "stationary"."""
+        """Number of frames with a flag other than "stationary" and "equal frame"."""
         return int(is_flagged(self.frames).sum())
 
     @property
@@ -63,8 +63,8 @@ class Result:
 
 
 def is_flagged(frames: pd.DataFrame) -> pd.Series:
-    """Whether a frame has a flag other than "stationary", booleans (n,), see Result.frames."""
-    return ~frames["flag"].isin(["", STATIONARY])
+    """Whether a frame has a flag that tells of doubt, booleans (n,), see Result.frames."""
+    return ~frames["flag"].isin(["", STATIONARY, EQUAL])
 
 
 def start_pose(sequence: Sequence) -> np.ndarray:
@@ -118,7 +118,8 @@ def run(
         started = time.perf_counter()
         mask = None if masks is None else masks[index]
         mask_seconds = time.perf_counter() - started
-        step = odometry.step(sequence.frame(index), step_lengths[index], mask)
+        frame, mask = sequence.frame(index), inside(sequence.visible(index), mask)
+        step = odometry.step(frame, step_lengths[index], mask)
         rows.append([*step.row().values(), mask_seconds])
     return _result(rows, settings)
 
@@ -136,7 +137,7 @@ def _faster_calls(frames: int, settings: OdometrySettings) -> Calls | None:
     def find(current: np.ndarray, previous: np.ndarray, threshold: float) -> tuple:
         return opencv_exact.find_essential_matrix(current, previous, threshold, PROBABILITY)
 
-    return Calls(settings.detect_function(), sharing.track, find, opencv_exact.recover_pose)
+    return Calls(settings.detector or detect, sharing.track, find, opencv_exact.recover_pose)
 
 
 def run_many(
@@ -166,7 +167,7 @@ def run_many(
         frame = sequence.frame(index)
         frame.setflags(write=False)  # so that all runs share it
         together.expect(frame, odometries.values())
-        masks_of_frame = _masks_of_frame(runs, index)
+        masks_of_frame = _masks_of_frame(runs, index, sequence.visible(index))
         for name, odometry in odometries.items():
             mask, mask_seconds = masks_of_frame[id(runs[name][1])]
             step = odometry.step(frame, step_lengths[index], mask)
@@ -176,16 +177,28 @@ def run_many(
 
 
 def _masks_of_frame(
-    runs: Mapping[Any, tuple[OdometrySettings, Masks | None]], index: int
+    runs: Mapping[Any, tuple[OdometrySettings, Masks | None]],
+    index: int,
+    visible: np.ndarray | None,
 ) -> dict[int, tuple[np.ndarray | None, float]]:
     """The mask of a frame and the seconds to make it, by the identity of the masks object."""
-    masks_of_frame: dict[int, tuple[np.ndarray | None, float]] = {id(None): (None, 0.0)}
+    masks_of_frame: dict[int, tuple[np.ndarray | None, float]] = {id(None): (visible, 0.0)}
     for _, masks in runs.values():
         if masks is not None and id(masks) not in masks_of_frame:
             started = time.perf_counter()
             mask = masks[index]
-            masks_of_frame[id(masks)] = mask, time.perf_counter() - started
+            seconds = time.perf_counter() - started
+            masks_of_frame[id(masks)] = inside(visible, mask), seconds
     return masks_of_frame
+
+
+def inside(visible: np.ndarray | None, mask: Any) -> Any:
+    """A mask without what is not visible (see Sequence.visible); both may be None: everywhere."""
+    if visible is None or mask is None:
+        return visible if mask is None else mask
+    if np.shape(mask) != visible.shape:  # the odometry names it
+        return mask
+    return mask & visible
 
 
 def check(sequence: Any, masks: Any) -> None:

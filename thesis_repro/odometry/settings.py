@@ -3,21 +3,13 @@
 import math
 import numbers
 from collections.abc import Callable
-from dataclasses import dataclass, fields
-from importlib import import_module
+from dataclasses import dataclass, fields, is_dataclass
 from typing import Any
 
 import numpy as np
 
 from thesis_repro.errors import InputError
-from thesis_repro.odometry import estimators
 
-CHOICES = {
-    "detector": ("shi-tomasi", "orb"),
-    "choice": ("strongest", "spread"),
-    "mask_mode": ("detect", "filter"),
-    "estimator": tuple(estimators.ESTIMATORS),
-}
 # Settings that do not change which keypoints are found in a frame. Runs that differ in nothing else
 # share keypoints, so a new setting belongs here only if it acts later.
 AFTER_DETECTION = {
@@ -32,7 +24,6 @@ AFTER_DETECTION = {
 # {name: (least, most)}
 LIMITS = {
     "max_keypoints": (0, 2**31 - 1),
-    "fill": (0, 1000),
     "min_distance": (0, 10_000),
     "redetect_below": (0, 2**31 - 1),
     "quality": (0, 1),
@@ -49,38 +40,32 @@ LIMITS = {
 class OdometrySettings:
     """Settings of the odometry. The defaults are the thesis's.
 
-    detector: "shi-tomasi", or "orb" (detection only; points are still tracked).
+    detector: finds the keypoints of a frame. None: the strongest Shi-Tomasi corners, as in the
+    thesis. Others are in `keypoints`: spread(200), filled(5), filtered, orb.
+    estimator: how the motion follows from the essential matrix, which allows four motions. None:
+    all points vote for one of the four, as in PySLAM. Others are in `estimators`. With
+    VoteOfInliers only the inliers vote (audit rows 13, 29). With `refined` the smaller of the two
+    possible rotations is taken, and the motion is refitted by least squares to all points near it.
+    If a car cannot make this motion within a frame, another one is searched for
+    (refined.motion_prior).
     max_keypoints: largest number of keypoints, 0 for no limit. min_distance, quality, block_size
     (all Shi-Tomasi): least distance between keypoints, pixels; least strength of a keypoint,
     relative to the strongest one; side of the square over which gradients are summed, pixels.
     window, levels: side of the tracker's window, pixels, and the number of times it halves the
     frame.
-    choice: the "strongest" max_keypoints, as in the thesis, or as many "spread" ones: the strongest
-    that are as far apart as their number allows (keypoints.spread).
-    fill: with a mask, number of keypoints in each of 16 x 5 fields of the frame that is filled up
-    from outside the mask (keypoints.filled). 0: none, as in the thesis.
-    mask_mode: "detect" gives the mask to the detector, which returns up to max_keypoints inside it;
-    "filter" drops keypoints outside the mask.
     redetect_below: if fewer points than this were tracked into a frame, new keypoints replace all
     of them.
     threshold: largest distance of an inlier of the essential matrix, in normalised image
     coordinates.
     shuffle_seed: seed with which the matched points are shuffled before RANSAC; None: not shuffled.
     RANSAC's own seed is fixed.
-    estimator: how the motion follows from the essential matrix, which allows four motions.
-    "thesis": all points vote for one of the four, as in PySLAM. "inliers": only the inliers vote
-    (audit rows 13, 29). "refined": the smaller of the two possible rotations is taken, and the
-    motion is refitted by least squares to all points near it. If a car cannot make this motion
-    within a frame, another one is searched for (refined.motion_prior).
     scale_gate: metres; a shorter step does not move the pose.
     """
 
-    detector: str = "shi-tomasi"
+    detector: Callable | None = None
+    estimator: Callable | None = None
     max_keypoints: int = 2000
-    choice: str = "strongest"
-    fill: int = 0
     min_distance: float = 3
-    mask_mode: str = "detect"
     redetect_below: int = 2000
     quality: float = 0.01
     block_size: int = 5
@@ -88,7 +73,6 @@ class OdometrySettings:
     levels: int = 3
     threshold: float = 0.0003
     shuffle_seed: int | None = None
-    estimator: str = "thesis"
     scale_gate: float = 0.1
 
     def of_detection(self) -> tuple:
@@ -101,29 +85,20 @@ class OdometrySettings:
             return slice(None)
         return np.random.default_rng((self.shuffle_seed, frame)).permutation(matches)
 
-    def detect_function(self) -> Callable:
-        """Return what finds keypoints: OpenCV's call, or `keypoints.detect` for other choices."""
-        if self.choice == "spread" or self.fill:
-            sharing = import_module("thesis_repro.odometry.sharing")
-            return sharing.SharedCalls().detect  # computes the strength of corners once a frame
-        if self.detector == "orb" or self.mask_mode == "filter":
-            return import_module("thesis_repro.odometry.keypoints").detect
-        return import_module("thesis_repro.odometry.odometry").detect
-
-    def new_estimator(self, calls: Any) -> Any:
-        """Return a new object of the estimator. calls: see odometry.Calls."""
-        return estimators.new_estimator(self.estimator, calls)
+    def record(self) -> dict[str, Any]:
+        """Return the settings as a record of results has them, equal in every process."""
+        return {
+            name: _text(value) if callable(value) else value for name, value in vars(self).items()
+        }
 
     def __post_init__(self) -> None:
-        for name, choices in CHOICES.items():
+        for name, example in {"detector": "spread(200)", "estimator": "refined"}.items():
             value = getattr(self, name)
-            if value not in choices:
+            if value is not None and not callable(value):
                 raise InputError(
-                    f"odometry setting {name}: {value!r} is unknown; "
-                    f"choose one of {', '.join(choices)}"
+                    f"odometry setting {name}: {value!r} is not a function or object, such as "
+                    f"thesis_repro.{example}"
                 )
-        if self.choice == "spread" and not self.max_keypoints:
-            raise InputError('odometry setting choice: "spread" needs max_keypoints of 1 or more')
         for field in fields(self):
             if field.name in LIMITS:
                 _check_number(field.name, getattr(self, field.name), field.type)
@@ -141,6 +116,16 @@ def _check_number(name: str, value: Any, kind: Any) -> None:
         raise InputError(
             f"odometry setting {name}: {value!r} is not a {words} from {least} to {most}"
         )
+
+
+def _text(value: Any) -> str:
+    """The name of a function, and of an object that is called like one with what it holds."""
+    if is_dataclass(value) and not isinstance(value, type):
+        parts = ", ".join(_text(part) for part in vars(value).values())
+        return f"{type(value).__qualname__}({parts})"
+    if hasattr(value, "__qualname__"):
+        return f"{value.__module__}.{value.__qualname__}"
+    return repr(value)
 
 
 THESIS = OdometrySettings()

@@ -14,6 +14,8 @@ from thesis_repro.errors import InputError
 
 NO_POINTS = np.empty((0, 2), np.float32)
 TIMED_PARTS = ("detect", "track", "essential", "pose")
+MIN_CONTRAST = 4.0  # standard deviation in gray levels; real frames have more than 50
+EQUAL = "equal frame"  # flag of a frame that equals the one before
 ROTATION_COLUMNS = [f"r{i}{j}" for i in range(3) for j in range(3)]
 
 
@@ -67,7 +69,11 @@ def motion_of_vote(votes: int, rotation: np.ndarray, translation: np.ndarray) ->
 
 
 class Estimator(Protocol):
-    """Completes the motion of a step: an essential matrix allows four motions."""
+    """Completes the motion of a step: an essential matrix allows four motions.
+
+    With a method `search(current, previous, threshold)`, as odometry.find_essential_matrix, it
+    brings its own search in place of RANSAC. Flags such as "no agreement" follow from its inliers.
+    """
 
     def motion(self, essential: np.ndarray, matches: Matches, scale: float, moves: bool) -> Motion:
         """Return the motion of a step.
@@ -178,7 +184,17 @@ def gray_frame(
         )
     if frame.flags.writeable:  # the caller may read the next frame into the same array
         frame = frame.copy()
+        frame.setflags(write=False)
     return frame
+
+
+def reasons_to_skip(frame: np.ndarray, previous: np.ndarray | None) -> list[str]:
+    """Return the flag of a frame without contrast, or of one that equals the frame before."""
+    if frame[::8, ::8].std() < MIN_CONTRAST:
+        return ["flat frame"]
+    if previous is not None and np.array_equal(frame, previous):
+        return [EQUAL]
+    return []
 
 
 def step_length(scale: Any, number: int) -> float:

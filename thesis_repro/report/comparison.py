@@ -20,8 +20,6 @@ from thesis_repro.study.jobs import ESTIMATORS
 from thesis_repro.study.sources import UNMASKED
 
 BROUGHT = ("masked", *UNMASKED)  # methods of what a user brings; the others are controls
-# methods in the figure, few enough for a small screen; the table has all
-SHOWN = (*BROUGHT, "corrected", "mirrored", "spread")
 REACHES = (2, 4, 8, 16, 64)  # of the figure's axis, which goes from 1 / reach to reach
 # columns of the failed runs of a method and of its reference, "2 of 40"
 FAILED = {"failed runs": "failed", "failed runs of the reference": "reference_failed"}
@@ -30,19 +28,19 @@ CHOICES = {"best": "best width", "left_out": "left-out width", "fixed": "one wid
 
 
 def figure_comparison(table: pd.DataFrame) -> Figure:
-    """Draw the ratios of masks and of some controls to all keypoints.
+    """Draw the ratios of masks, other masks and controls to all keypoints.
 
     Grey dots are the sequences, the coloured mark is their typical ratio with its interval. The
     figure has one row of panels for each estimator and one column for each judging metric, all with
-    one scale, which shows nine of ten sequences. A sequence beyond it is named at the edge. With
-    several sources of masks it shows no controls.
+    one scale, which shows nine of ten sequences. A sequence beyond it is named at the edge, and an
+    arrow marks an interval that is cut. With several sources of masks it shows no controls.
     """
     rows = _shown(table)
-    rows = rows[rows["method"].isin(SHOWN) & rows["metric"].isin(compare.JUDGING_METRICS)]
+    rows = rows[rows["metric"].isin(compare.JUDGING_METRICS)]
     order = list(rows["label"].unique())
     estimators = [name for name in ESTIMATORS if (rows["estimator"] == name).any()]
     metrics = [name for name in compare.JUDGING_METRICS if (rows["metric"] == name).any()]
-    height = 0.7 + (0.8 + 0.36 * len(order)) * len(estimators)
+    height = 0.7 + (0.8 + 0.33 * len(order)) * len(estimators)
     figure, axes = style.new_figure(
         len(estimators), len(metrics), squeeze=False, sharex=True, sharey=True, height=height
     )
@@ -84,8 +82,14 @@ def _draw_ratios(
                 place: dict[str, Any] = {"ha": "right" if edge > 1 else "left", "fontsize": 7}
                 panel.plot(edge, y - 0.1, marker, clip_on=False, **dot)
                 panel.text(edge, y - 0.22, f" {', '.join(named)} ", va="bottom", **place)
-        interval = [row["low"], row["high"]]
+        interval = np.clip([row["low"], row["high"]], 1 / reach, reach)
         panel.plot(interval, [y + 0.2] * 2, **style.interval_style(color, "|"))
+        for edge, marker, is_cut in (
+            (1 / reach, "<", row["low"] < 1 / reach),
+            (reach, ">", row["high"] > reach),
+        ):
+            if is_cut:
+                panel.plot(edge, y + 0.2, marker, color=color, markersize=5, clip_on=False)
         panel.plot(row["ratio"], y + 0.2, "D", color=color, markersize=4, markeredgewidth=0)
     panel.axvline(1, color="black", linewidth=0.8)
     panel.grid(axis="y", visible=False)
@@ -104,7 +108,7 @@ def _shown(table: pd.DataFrame) -> pd.DataFrame:
     sources_of_masks = rows.loc[rows["method"] == "masked", "source"]
     if sources_of_masks.nunique() > 1:  # controls of every source would be dozens of rows
         rows = rows[rows["method"].isin(BROUGHT)]
-    return rows.assign(label=_labels(rows))
+    return rows.assign(label=label_rows(rows))
 
 
 def _tested(rows: pd.DataFrame) -> pd.DataFrame:
@@ -116,7 +120,7 @@ def _tested(rows: pd.DataFrame) -> pd.DataFrame:
     return rows[rows["tested"] | ~rows["source"].isin(masked["source"])]
 
 
-def _labels(rows: pd.DataFrame) -> pd.Series:
+def label_rows(rows: pd.DataFrame) -> pd.Series:
     """Label each row with its method and the width of its masks.
 
     If there are several sources, the label begins with the row's source. Own keypoints and paths
@@ -139,14 +143,18 @@ def table_summary(table: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
     """Return one row for each source: the answer of a study, see `compare.primary_comparison`.
 
     The columns are the mean number of keypoints that the source leaves and that of all, the ratio
-    of each judging metric, the verdict, and the control that does not use the classes in the frame
-    and has the lowest ratio of the first judging metric.
+    of each judging metric, the verdict, the estimator that these are of, failed runs (those of
+    another estimator stand behind its name), and the control that does not use the classes in the
+    frame and has the lowest ratio of the first judging metric.
     """
     estimator = compare.judging_estimator(table)
     total = compare.of_method(runs, "baseline", estimator)["mean_keypoints"].mean()
-    over_all = _over_all_keypoints(table[table["estimator"] == estimator])
-    judged = over_all[over_all["tested"] & over_all["metric"].isin(compare.JUDGING_METRICS)]
-    judged = judged[judged["method"].isin(BROUGHT)]
+    over_all = _over_all_keypoints(table)
+    is_judged = over_all["tested"] & over_all["metric"].isin(compare.JUDGING_METRICS)
+    brought = over_all[is_judged & over_all["method"].isin(BROUGHT)]
+    others = brought[brought["estimator"] != estimator].drop_duplicates(["source", "estimator"])
+    over_all = over_all[over_all["estimator"] == estimator]
+    judged = brought[brought["estimator"] == estimator]
     first_metric = next(iter(compare.JUDGING_METRICS))
     controls = _tested(over_all[over_all["metric"] == first_metric])
     controls = controls[controls["method"].isin(compare.SEGMENTATION_FREE_CONTROLS)]
@@ -158,8 +166,13 @@ def table_summary(table: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
             "keypoints": f"{first['keypoints']:.0f} instead of {total:.0f}",
             **{compare.METRICS[line["metric"]]: _short(line) for _, line in pair.iterrows()},
             "verdict": compare.overall(pair["verdict"]),
-            **{name: first[column] for name, column in FAILED.items()},
+            "estimator": ESTIMATORS[estimator],
         }
+        of_others = others[others["source"] == source]
+        for name, column in FAILED.items():
+            counts = zip(of_others["estimator"], of_others[column], strict=True)
+            named = [f"{ESTIMATORS[other]} {count}" for other, count in counts]
+            row[name] = "; ".join([first[column], *named])
         if first["method"] == "paths":
             row["keypoints"] = ""
         of_source = controls[controls["source"] == source]
@@ -180,7 +193,7 @@ def table_comparison(table: pd.DataFrame) -> pd.DataFrame:
     """
     rows = pd.concat([_tested(_over_all_keypoints(table)), table[table["reference"] != "baseline"]])
     numbers = rows["keypoints"].round().astype("Int64")  # missing for paths of another system
-    rows = rows.assign(label=_labels(rows), keypoints=numbers)
+    rows = rows.assign(label=label_rows(rows), keypoints=numbers)
     sequences = _sequences(table)
     keys = ["estimator", "source", "method", "dilation_width", "reference_source", "reference"]
     lines = []
@@ -235,14 +248,14 @@ def table_errors(table: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
     """Return the errors of the methods of the figure and of all keypoints, one column a sequence.
 
     There is a row for each judging metric, estimator and method. A cell has the mean and the
-    standard deviation over the repetitions, "0.0103 ± 0.0021". The lowest mean of a sequence is
-    bold, as Markdown has it: "**0.0103 ± 0.0021**".
+    standard deviation over the repetitions, "0.0103 ± 0.0021", if it is not 0. The lowest mean of a
+    sequence is bold, as Markdown has it: "**0.0103 ± 0.0021**".
     """
     labels = [compare.METHODS["baseline"], *_shown(table)["label"].unique()]
     parts = {}
     for metric, estimator in product(compare.JUDGING_METRICS, NEUTRAL_ESTIMATORS):
         rows = runs[runs["estimator"] == estimator].dropna(subset=[metric])
-        errors = rows.groupby([_labels(rows), "sequence"])[metric]
+        errors = rows.groupby([label_rows(rows), "sequence"])[metric]
         means = errors.mean().unstack().reindex(labels)
         cells = errors.agg(_mean_and_spread).unstack().reindex(labels)
         cells = cells.mask(means == means.min(), "**" + cells + "**")
@@ -254,13 +267,14 @@ def table_errors(table: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
 
 
 def _mean_and_spread(errors: pd.Series) -> str:
-    """Return "0.0103 ± 0.0021", or only the mean of a single error."""
+    """Return "0.0103 ± 0.0021", or only the mean if the deviation is 0 in these digits."""
     mean = errors.mean()
     magnitude = max(mean, 1e-4)  # an error of 0 gets no more digits than a tenth of a millimetre
     digits = max(0, 2 - floor(log10(magnitude)))  # after the point, for three that are not 0
-    if len(errors) == 1:
+    deviation = f"{errors.std():.{digits}f}"
+    if len(errors) == 1 or float(deviation) == 0:
         return f"{mean:.{digits}f}"
-    return f"{mean:.{digits}f} ± {errors.std():.{digits}f}"
+    return f"{mean:.{digits}f} ± {deviation}"
 
 
 def table_widths(runs: pd.DataFrame) -> pd.DataFrame:

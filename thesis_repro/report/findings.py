@@ -1,105 +1,169 @@
-"""The findings of a run, a study or the evidence on real frames, in words.
+"""The findings of a run, a study or the evidence on real frames: sentences and tables.
 
-They share one template (findings.md.j2). Its conditions depend only on what was run and on the
-verdicts.
+Each table is a selection from `compare.comparisons`. The words stand in findings.md.j2.
 """
-
-from typing import Any
 
 import pandas as pd
 
-from thesis_repro.report import texts
+from thesis_repro.report import comparison, style, texts
 from thesis_repro.study import best_width, compare
 from thesis_repro.study.jobs import CONTROL_WIDTH, ESTIMATORS
-from thesis_repro.study.sources import UNMASKED
 
-# what the template of the findings says of every comparison, whatever was run
-OF_COMPARISONS = {
-    "estimators": ESTIMATORS,
-    "methods": compare.METHODS,
-    "metrics": compare.METRICS,
-    "deciding_metrics": list(compare.JUDGING_METRICS),
-    "too_few": compare.TOO_FEW,
-    "fewest": compare.MIN_SEQUENCES,
-    "power": compare.POWER,
-    "level": compare.LEVEL,
-    "far": compare.FAR_OFF,
-    "thesis_width": CONTROL_WIDTH,
+OUTCOMES = {
+    compare.LOWER: "lower errors than with all keypoints",
+    compare.HIGHER: "higher errors than with all keypoints",
+    compare.NO_CLEAR_DIFFERENCE: "no clear difference from all keypoints",
+    compare.TOO_FEW: "too few sequences to tell",
 }
+SHOWN = (*compare.JUDGING_METRICS, "rmse")  # the last one as the thesis measures it
+WORLD = " The embedded world has rendered streets; its results are no evidence about KITTI."
 
 
-def text(
-    runs: pd.DataFrame,
-    table: pd.DataFrame,
-    data: str,
-    embedded: bool,
-    label_maps: list[dict[str, Any]] | tuple[()] = (),
-    trainings: list[dict[str, Any]] | tuple[()] = (),
-    procedure: list[dict[str, Any]] | tuple[()] = (),
-) -> str:
+def text(runs: pd.DataFrame, table: pd.DataFrame, data: str, embedded: bool, more: str = "") -> str:
     """Return the findings of a run, a study or the evidence as Markdown.
 
     table: `compare.comparisons` of the runs. data: one line with the origin of the data.
     embedded: whether the frames are those of the embedded world, which is no evidence about KITTI.
-    The reproduction of the thesis adds: label_maps, the quality of the label maps, one dict a
-    domain; trainings, what other trainings of the network give, one dict an estimator; procedure,
-    what the thesis's own procedure gives, one dict a metric (see the modules in notebooks/thesis).
+    more: Markdown below the first table.
     """
-    baseline = runs[runs["method"] == "baseline"]
-    with_masks = runs.loc[runs["method"] == "masked", "source"].unique()
-    factors = compare.shuffle_spread(runs).groupby("estimator")["factor"]
-    spread = factors.agg(["median", "max"]).reindex(list(ESTIMATORS)).dropna()
-    measured = set(table["metric"])
-    deciding = [label for name, label in compare.JUDGING_METRICS.items() if name in measured]
-    both_masked = (table["method"] == "masked") & (table["reference"] == "masked")
-    once = table["source"] < table["reference_source"]  # each pair of sources
-    unmasked = table["method"].isin(UNMASKED)
+    rows = _over_all_keypoints(table)
+    judging = rows[rows["decides"] & (rows["method"] != "corrected")]
+    controls = compare.against(table, compare.SEGMENTATION_FREE_CONTROLS)
+    controls = controls[controls["reference_source"] == controls["source"]]
+    verdicts = controls.groupby(["source", "reference"], sort=False)["verdict"].agg(compare.overall)
+    sources = []
+    for (source, label), pair in judging.groupby(["source", "label"], sort=False):
+        outcome = OUTCOMES[compare.overall(pair["verdict"])]
+        sources.append({"title": label, "outcome": outcome, "of_controls": ""})
+        if source in verdicts:
+            beaten = (verdicts[source] == compare.LOWER).sum()
+            sources[-1]["of_controls"] = (
+                f" Errors are lower than with {beaten} of {len(verdicts[source])} controls without "
+                "segmentation."
+            )
     return texts.render(
         "findings.md.j2",
-        **OF_COMPARISONS,
+        sources=sources,
+        here="in the embedded world" if embedded else "here",
+        world=WORLD if embedded else "",
+        more=more,
         data=data,
-        embedded=embedded,
-        label_maps=label_maps,
-        trainings=trainings,
-        frames=baseline.groupby("sequence")["frames"].first().to_dict(),
-        repetitions=baseline["repetition"].nunique(),
-        spread=spread.T.to_dict(),
-        deciding=deciding,
-        estimators_run=set(table["estimator"]),
-        sources=[_source_values(runs, table, source) for source in with_masks],
-        procedure=procedure,
-        others=table[(both_masked & once | unmasked) & _judging(table)].to_dict("records"),
+        frames=_frames(runs),
+        level=compare.LEVEL,
+        fewest=compare.MIN_SEQUENCES,
+        far=compare.FAR_OFF,
+        thesis_width=CONTROL_WIDTH,
+        ratios=_markdown(_ratios(rows)),
+        spread=_markdown(_spread(runs)),
+        failures=_markdown(_failures(rows)),
+        controls=_markdown(verdicts.rename(compare.METHODS).unstack("source").reset_index()),
+        pairs=_markdown(_pairs(table)),
+        stability=_markdown(_stability(runs)),
     )
 
 
-def _judging(table: pd.DataFrame) -> pd.Series:
-    """Return for each row of `compare.comparisons` whether it may decide, bool."""
-    metric = table["metric"].isin(compare.JUDGING_METRICS)
-    return metric & (table["estimator"] == compare.judging_estimator(table))
+def _markdown(table: pd.DataFrame) -> str:
+    return style.markdown(table) if len(table) else ""
 
 
-def _source_values(runs: pd.DataFrame, table: pd.DataFrame, source: str) -> dict[str, Any]:
-    """Return the values of one source of masks for the template."""
-    runs = compare.of_source(runs, source)
-    masked = compare.of_method(runs, "masked")
-    stability = best_width.stability(masked, compare.of_method(runs, "baseline"))
-    judged = compare.primary_comparison(table, source)
-    over_all = (table["source"] == source) & (table["reference"] == "baseline") & table["tested"]
-    of_masks = table[over_all & (table["method"] == "masked")]
-    of_corrected = table[over_all & (table["method"] == "corrected") & _judging(table)]
-    controls = compare.against(table, compare.SEGMENTATION_FREE_CONTROLS, source)
-    controls = controls[controls["reference_source"] == source]
-    verdicts = controls.groupby("reference", sort=False)["verdict"].agg(compare.overall)
-    return {
-        "name": source,
-        "judged": judged.to_dict("records"),
-        "verdict": compare.overall(judged["verdict"]),
-        "width": compare.tested_width(runs),
-        "masked": of_masks.to_dict("records"),
-        "failures": of_masks.drop_duplicates("estimator").to_dict("records"),
-        "corrected": of_corrected.to_dict("records"),
-        "controls": verdicts.to_dict(),
-        "widths": masked["dilation_width"].nunique(),
-        "same_best": stability["same_best"].mean(),
-        "repeated": stability["same_best"].count(),
-    }
+def _over_all_keypoints(table: pd.DataFrame) -> pd.DataFrame:
+    """Return the rows of what is compared with all keypoints, with columns label and decides."""
+    methods = (*comparison.BROUGHT, "corrected")
+    rows = table[(table["reference"] == "baseline") & table["tested"]]
+    rows = rows[rows["method"].isin(methods) & rows["metric"].isin(SHOWN)]
+    is_judging = rows["metric"].isin(compare.JUDGING_METRICS)
+    decides = is_judging & (rows["estimator"] == compare.judging_estimator(table))
+    return rows.assign(label=comparison.label_rows(rows), decides=decides).sort_values(
+        "decides", ascending=False, kind="stable"
+    )
+
+
+def _ratios(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return the ratios to all keypoints, one row for each source, estimator and error."""
+    lines = []
+    for _, row in rows.iterrows():
+        ratios = row.drop([*compare.COLUMNS, *row["far_off"], "label", "decides"]).dropna()
+        without = ""
+        if row["far_off"]:
+            left_out = ", ".join(row["far_off"])
+            without = f"{texts.ratio(compare.typical_ratio(ratios))} without {left_out}"
+        lines.append(
+            {
+                "keypoints": row["label"],
+                "estimator": ESTIMATORS[row["estimator"]],
+                "error": compare.METRICS[row["metric"]],
+                "ratio": texts.ratio(row),
+                "without what is far off": without,
+                "above 1": f"{row['above']} of {row['n']}",
+                "verdict": row["verdict"],
+                "decides": "yes" if row["decides"] else "",
+            }
+        )
+    return pd.DataFrame(lines)
+
+
+def _failures(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return the failed runs of each source and of all keypoints, one row for each estimator."""
+    counted = rows.drop_duplicates(["label", "estimator"])
+    return pd.DataFrame(
+        {
+            "keypoints": counted["label"],
+            "estimator": counted["estimator"].map(ESTIMATORS),
+            "failed runs": counted["failed"],
+            "with all keypoints": counted["reference_failed"],
+            "sequences with more": counted["more_failures"],
+            "with fewer": counted["fewer_failures"],
+            "verdict": counted["failures_verdict"],
+        }
+    )
+
+
+def _pairs(table: pd.DataFrame) -> pd.DataFrame:
+    """Return the ratios of masks of one source to masks of another, each pair once."""
+    both = (table["method"] == "masked") & (table["reference"] == "masked")
+    rows = table[both & (table["source"] < table["reference_source"])]
+    rows = rows[rows["metric"].isin(compare.JUDGING_METRICS)]
+    rows = rows[rows["estimator"] == compare.judging_estimator(table)]
+    return pd.DataFrame(
+        {
+            "masks": rows["source"],
+            "divided by": rows["reference_source"],
+            "error": rows["metric"].map(compare.METRICS),
+            "ratio": [texts.ratio(row) for _, row in rows.iterrows()],
+            "verdict": rows["verdict"],
+        }
+    )
+
+
+def _spread(runs: pd.DataFrame) -> pd.DataFrame:
+    """Return how much shuffling changes the RMSE with all keypoints, one row an estimator."""
+    factors = compare.shuffle_spread(runs).groupby("estimator")["factor"]
+    spread = factors.agg(["median", "max"]).reindex(list(ESTIMATORS)).dropna().round(3)
+    return spread.rename(index=ESTIMATORS, columns={"max": "highest"}).reset_index()
+
+
+def _stability(runs: pd.DataFrame) -> pd.DataFrame:
+    """Return how often a best width wins again, one row for each source with repeated widths."""
+    lines = []
+    for source in compare.sources(runs) or [""]:
+        of_source = compare.of_source(runs, source)
+        masked = compare.of_method(of_source, "masked")
+        stability = best_width.stability(masked, compare.of_method(of_source, "baseline"))
+        widths, same = masked["dilation_width"].nunique(), stability["same_best"]
+        if same.count():
+            line = {"source": source, "sequences": same.count(), "widths": widths}
+            lines.append(
+                line | {"wins again": same.mean().round(), "by chance": round(100 / widths)}
+            )
+    return pd.DataFrame(lines)
+
+
+def _frames(runs: pd.DataFrame) -> str:
+    """Return one line with the sequences, their frames and the number of repetitions."""
+    baseline = runs[runs["method"] == "baseline"]
+    frames = baseline.groupby("sequence")["frames"].first()
+    counts = [f"{texts.in_markdown(name)} ({count} frames)" for name, count in frames.items()]
+    return (
+        f"Sequences: {', '.join(counts)}. Repetitions of every run that decides: "
+        f"{baseline['repetition'].nunique()}."
+    )

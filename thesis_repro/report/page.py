@@ -37,7 +37,7 @@ NOT_OF_THESIS: dict[str, Any] = {"number": None, "makers": [], "thesis": {}, "le
 def build_study(folder: Path, names: list[tuple[str, str]], **facts: Any) -> str:
     """Return the page of a study as HTML.
 
-    names: (kind, name) of its files. facts: further values of the template.
+    names: (kind, name) of its files. facts: further values of the template, and the study itself.
     """
     described = []
     for artefact in ARTEFACTS:
@@ -47,9 +47,10 @@ def build_study(folder: Path, names: list[tuple[str, str]], **facts: Any) -> str
             if (kind, base) == (artefact["kind"], artefact["name"]):
                 title = f"{artefact['title']} {sequence}".strip()
                 described.append(describe(folder, artefact | {"name": name, "title": title}))
+    compared = dict.fromkeys(facts["kinds"][source.kind] for source in facts["study"].sources)
     return texts.render(
         "study.html.j2",
-        title="A study of masks",
+        title=f"{' and '.join(compared).capitalize()}, compared with all keypoints",
         artefacts=described,
         notebooks={},
         made=made_with() | made_on(),

@@ -16,24 +16,34 @@ from thesis_repro.data.trajectories import write_kitti_poses, write_tum
 from thesis_repro.errors import one_line
 from thesis_repro.mask_files import LabelMasks, label_map_of
 from thesis_repro.masks import MaskSettings
-from thesis_repro.odometry import THESIS, keypoints, metrics
-from thesis_repro.report import comparison, findings, page, paths, style
+from thesis_repro.odometry import THESIS, metrics
+from thesis_repro.odometry.odometry import detect
+from thesis_repro.odometry.runs import inside
+from thesis_repro.report import comparison, findings, page, paths, style, worth
 from thesis_repro.running import results
 from thesis_repro.running.files import write_text
 from thesis_repro.study import compare, methods, runner
 from thesis_repro.study.jobs import ESTIMATORS
-from thesis_repro.study.sources import KINDS, UNMASKED, FileMasks, Source
+from thesis_repro.study.sources import KINDS, UNMASKED, FileMasks, Source, own_calls
 from thesis_repro.study.study import RUNS, Study
 
 PATHS = "paths"  # folder of the estimated paths
+DRAWN = ("masked", "keypoints")  # methods of what a user brings that acts on frames
+NO_DEVIATION = "Without $\\pm$: the standard deviation is 0 in these digits, or there is one run."
 FIT = 4  # columns of errors across a page, in letters that can be read
 
 
 @style.applied()
-def write(study: Study, runs: pd.DataFrame, folder: Path, warnings: Collection[str] = ()) -> Path:
+def write(
+    study: Study,
+    runs: pd.DataFrame,
+    folder: Path,
+    warnings: Collection[str] = (),
+    worths: pd.DataFrame | None = None,
+) -> Path:
     """Write the findings, figures, tables and page of a `Study` into a folder.
 
-    Returns the page's path. warnings: lines for the top of the page.
+    Returns the page's path. warnings: lines for the top of the page. worths: of `Study.worths`.
     """
     # `thesis-repro synthesize` leaves a record beside the KITTI folder of an embedded world
     world = results.record(study.kitti.resolve().parent) or {}
@@ -48,7 +58,7 @@ def write(study: Study, runs: pd.DataFrame, folder: Path, warnings: Collection[s
     note = one_line(f"odometry: {data}; compared: {', '.join(masks)}")
     write_paths(study, runs, folder)
     figures = {}
-    if (runs["method"] == "masked").any():
+    if runs["method"].isin(DRAWN).any():
         figures["sources"] = figure_sources(study, runs)
     for sequence in study.opened:
         figures[f"paths-{sequence.name}"] = figure_paths(study, runs, sequence, folder)
@@ -57,18 +67,23 @@ def write(study: Study, runs: pd.DataFrame, folder: Path, warnings: Collection[s
     table = compare.comparisons(runs)
     write_text(folder / "findings.md", findings.text(runs, table, note, embedded))
     figures = {"comparison": comparison.figure_comparison(table), **figures}
+    if worths is not None:
+        figures["worth"] = worth.figure(worths)
     for name, figure in figures.items():
         style.write_figure(figure, folder / f"{name}.pdf")
     numbers = {
-        "summary": comparison.table_summary(table, runs),
+        "summary": pd.concat([comparison.table_summary(table, runs), _failed(study, runs)]),
         "comparison": comparison.table_comparison(table),
         "widths": comparison.table_widths(runs),
         "errors": comparison.table_errors(table, runs),
     }
+    if worths is not None:
+        numbers["worth"] = worth.table(worths)
+        results.write_table(folder / "worth_runs.csv", worths)
     for name, rows in numbers.items():
         text = latex(rows)
         if name == "errors":
-            text = latex_errors(rows)
+            text = latex_errors(rows, study.repetitions)
         if name == "summary" and len(rows):  # one column a source fits into a column of text
             text = latex(rows.set_index("source").T.rename_axis("source").reset_index())
         write_text(folder / f"{name}.tex", f"% {note}\n{text}")
@@ -89,6 +104,15 @@ def write(study: Study, runs: pd.DataFrame, folder: Path, warnings: Collection[s
     )
     write_text(folder / page.PAGE, text)
     return folder / page.PAGE
+
+
+@style.applied()
+def write_worths(study: Study, worths: pd.DataFrame, folder: Path) -> Path:
+    """Write the worths of a study without ground truth, which has no errors; return the table."""
+    note = one_line(f"KITTI folder {study.kitti.name}, without ground truth")
+    results.write_table(folder / "worth_runs.csv", worths)
+    style.save_all({"worth": worth.figure(worths)}, {"worth": worth.table(worths)}, folder, note)
+    return folder / "worth.md"
 
 
 def write_paths(study: Study, runs: pd.DataFrame, folder: Path) -> None:
@@ -120,49 +144,45 @@ def latex(table: pd.DataFrame) -> str:
     return f"\\resizebox{{{width}}}{{!}}{{%\n{text}}}\n"
 
 
-def latex_errors(table: pd.DataFrame) -> str:
+def latex_errors(table: pd.DataFrame, repetitions: int = 1) -> str:
     """Return `comparison.table_errors` as LaTeX: tables of at most FIT sequences.
 
-    Each table has one error and one estimator, which stand in a line above it.
+    Each table has one error and one estimator, which stand in a line above it. A note below it
+    tells of means without a deviation, if there are several repetitions.
     """
     parts = []
     for (error, estimator), rows in table.groupby(["error", "estimator"], sort=False):
         sequences = rows.columns.drop(["error", "estimator", "method"])
         for first in range(0, len(sequences), FIT):
             columns = ["method", *sequences[first : first + FIT]]
-            parts.append(f"\\noindent {error}, {estimator}\\par\n{latex(rows[columns])}")
+            text = f"\\noindent {error}, {estimator}\\par\n{latex(rows[columns])}"
+            if repetitions > 1 and not rows[columns[1:]].map(lambda cell: "±" in str(cell)).all(
+                axis=None
+            ):
+                text += f"\\par\\noindent {NO_DEVIATION}\\par\n"
+            parts.append(text)
     return "\n".join(parts)
-
-
-def shown_width(study: Study) -> int | None:
-    """Return the dilation width (pixels) of the masks in figures.
-
-    It is the tested width, or else the middle one; None for only ready-made masks.
-    """
-    if study.tested or not study.widths:
-        return study.tested
-    return study.widths[len(study.widths) // 2]
 
 
 def shown_masks(study: Study) -> list[tuple[Sequence, list[FileMasks]]]:
     """Return each sequence with the masks of each source, at the `shown_width`."""
     sources = [source for source in study.sources if source.kind not in UNMASKED]
     return [
-        (sequence, [source.masks(sequence, shown_width(study)) for source in sources])
+        (sequence, [source.masks(sequence, study.shown_width) for source in sources])
         for sequence in study.opened
     ]
 
 
 def figure_sources(study: Study, runs: pd.DataFrame) -> Figure:
-    """Draw the middle frame of the first sequence that has runs with masks, one row a source.
+    """Draw the middle frame of the first sequence that has such runs, one row a source.
 
     A row shows the source's label map (or the frame, if there is none), its mask and the kept
-    keypoints, so that a person sees which masks are inverted or lie elsewhere. Sources whose runs
-    failed are left out.
+    keypoints, so that a person sees which masks are inverted or lie elsewhere. Own keypoints have
+    no mask. Sources whose runs failed are left out.
     """
-    masked = runs[runs["method"] == "masked"]
-    name = masked["sequence"].iloc[0]
-    with_runs = set(masked.loc[masked["sequence"] == name, "source"])
+    drawn = runs[runs["method"].isin(DRAWN)]
+    name = drawn["sequence"].iloc[0]
+    with_runs = set(drawn.loc[drawn["sequence"] == name, "source"])
     sources = [source for source in study.sources if source.name in with_runs]
     (sequence,) = (sequence for sequence in study.opened if sequence.name == name)
     index = len(sequence) // 2
@@ -170,20 +190,30 @@ def figure_sources(study: Study, runs: pd.DataFrame) -> Figure:
     label_maps = []
     figure, axes = style.frame_panels(frame, len(sources), 3, 1.5 * style.PAGE_WIDTH)
     for (first, second, third), source in zip(np.reshape(axes, (-1, 3)), sources, strict=True):
-        masks = source.masks(sequence, shown_width(study))
         style.show_image(first, frame, f"{source.name}: frame {index}")
-        if isinstance(masks, LabelMasks):
-            label_maps.append(label_map_of(masks, index))
-            colors = style.label_colors(label_maps[-1], frame)
-            style.show_image(first, colors, f"{source.name}: label map")
-        mask = masks[index]
-        style.show_image(second, mask, f"{source.name}: mask", vmin=0, vmax=255)
-        points = keypoints.detect(frame, THESIS, mask)
+        if source.kind == "keypoints":
+            second.set_axis_off()
+            points = own_calls(source.folder).detect(frame, THESIS, None)
+        else:
+            masks = source.masks(sequence, study.shown_width)
+            if isinstance(masks, LabelMasks):
+                label_maps.append(label_map_of(masks, index))
+                colors = style.label_colors(label_maps[-1], frame)
+                style.show_image(first, colors, f"{source.name}: label map")
+            mask = masks[index]
+            style.show_image(second, mask, f"{source.name}: mask", vmin=0, vmax=255)
+            points = detect(frame, mask=inside(sequence.visible(index), mask))
         style.show_image(third, frame, f"{source.name}: {len(points)} keypoints")
         third.scatter(*points.T, **style.KEYPOINT)
     if label_maps:
         style.class_legend(figure, *label_maps)
     return figure
+
+
+def _failed(study: Study, runs: pd.DataFrame) -> pd.DataFrame:
+    """Return rows of the summary for sources without any run."""
+    names = [source.name for source in study.sources if source.name not in set(runs["source"])]
+    return pd.DataFrame({"source": names, "verdict": ["all runs failed"] * len(names)})
 
 
 def figure_paths(study: Study, runs: pd.DataFrame, sequence: Sequence, folder: Path) -> Figure:
@@ -194,7 +224,7 @@ def figure_paths(study: Study, runs: pd.DataFrame, sequence: Sequence, folder: P
         & (runs["repetition"] == 0)
         & (runs["estimator"] == compare.judging_estimator(runs))
         & runs["method"].isin(["baseline", "masked", *UNMASKED])
-        & (widths.isna() | (widths == shown_width(study)))
+        & (widths.isna() | (widths == study.shown_width))
     ]
     shown = {}
     poses = runner.run_poses(rows, folder / RUNS)

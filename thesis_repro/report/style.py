@@ -104,7 +104,7 @@ def interval_style(color: str, cap: str) -> dict[str, Any]:
 def label_colors(label_map: np.ndarray, frame: np.ndarray) -> np.ndarray:
     """Return a label map in colours, enlarged to the frame's size for display.
 
-    masks.py enlarges in another way.
+    masks/filter.py enlarges in another way.
     """
     height, width = frame.shape[:2]
     rows = np.arange(height) * label_map.shape[0] // height

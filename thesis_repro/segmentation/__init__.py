@@ -4,11 +4,12 @@ Augmentation, the U-Net, its training, label maps and their quality. The first i
 environment variables that TensorFlow and the other libraries read when they are imported.
 """
 
+import io
 import os
 import platform
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
 
 from thesis_repro.running import messages
 
@@ -56,11 +57,11 @@ def arithmetic() -> dict[str, str | None]:
 
 @contextmanager
 def quietly() -> Iterator[None]:
-    """Hide the messages that TensorFlow's C++ code prints while it loads, whatever its log level.
+    """Hide what libraries print while they load: TensorFlow's C++ code, segmentation-models.
 
     Errors are raised. The message that there is no GPU is hidden too.
     """
-    with messages.quiet():
+    with messages.quiet(), redirect_stdout(io.StringIO()):
         yield
         if not any(map(os.path.exists, GPUS)):
             sys.modules["tensorflow"].config.list_physical_devices()

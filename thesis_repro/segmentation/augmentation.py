@@ -114,9 +114,9 @@ def augment_set(
     return augmented_images, augmented_labels
 
 
-def image_seed(seed: int, index: int, epoch: int = 0) -> int:
+def image_seed(seed: int, index: int) -> int:
     """Return the seed of one image, independent of the order in which images are augmented."""
-    return int(np.random.SeedSequence((seed, epoch, index)).generate_state(1)[0])
+    return int(np.random.SeedSequence((seed, 0, index)).generate_state(1)[0])
 
 
 def one_hot(label_maps: np.ndarray, n_classes: int) -> np.ndarray:

@@ -12,7 +12,6 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-import albumentations as A
 import keras
 import numpy as np
 import pandas as pd
@@ -105,15 +104,14 @@ class Batches:
         sets: list[tuple[np.ndarray, np.ndarray]],
         batch_size: int,
         seed: Any = None,
-        transforms: A.Compose | None = None,
     ) -> None:
         """sets: (images, label maps) pairs; seed: None keeps their order.
 
-        transforms: if given, there are two sets of one length, and every epoch augments the first
-        set again and uses the result instead of the second set.
-        Raises InputError for an empty set, images that are not uint8, and images and label maps
-        that do not match.
+        Raises InputError for an empty set, images that are not uint8, images and label maps that do
+        not match, ids above 34 and a batch size below 1.
         """
+        if batch_size < 1:
+            raise InputError(f"batch size {batch_size}: must be 1 or more")
         for images, labels in sets:
             is_uint8 = images.ndim == 4 and images.dtype == np.uint8
             if not is_uint8 or len(images) == 0 or images.shape[:3] != labels.shape:
@@ -121,8 +119,14 @@ class Batches:
                     f"images {images.shape} {images.dtype} and label maps {labels.shape}; expected (n, "
                     "size, size, channels) uint8 and (n, size, size), n at least 1"
                 )
+            for number, label_map in enumerate(labels):
+                unknown = label_map[(label_map >= N_CLASSES) & (label_map != augmentation.NOTHING)]
+                if len(unknown):
+                    raise InputError(
+                        f"label map {number}: holds {unknown[0]}; must hold Cityscapes label ids, 0 to "
+                        f"{N_CLASSES - 1}, or {augmentation.NOTHING} for no class"
+                    )
         self.sets, self.batch_size, self.seed = sets, batch_size, seed
-        self.transforms = transforms
         self.epoch = 0
         self._places = [
             (number, index)
@@ -135,22 +139,13 @@ class Batches:
 
     def __iter__(self) -> Iterator[tuple[np.ndarray, ...]]:
         """Yield the batches of the current epoch: uint8 images and uint8 label maps."""
-        epoch, order = self.epoch, np.arange(len(self._places))
+        order = np.arange(len(self._places))
         if self.seed is not None:
-            order = np.random.default_rng((self.seed, epoch)).permutation(len(order))
+            order = np.random.default_rng((self.seed, self.epoch)).permutation(len(order))
         for start in range(0, len(order), self.batch_size):
-            pairs = [
-                self._pair(epoch, *self._places[place])
-                for place in order[start : start + self.batch_size]
-            ]
+            places = [self._places[place] for place in order[start : start + self.batch_size]]
+            pairs = [[array[index] for array in self.sets[number]] for number, index in places]
             yield tuple(map(np.stack, zip(*pairs)))
-
-    def _pair(self, epoch: int, number: int, index: int) -> tuple[np.ndarray, ...]:
-        if number and self.transforms:
-            images, labels = self.sets[0]
-            seed = augmentation.image_seed(self.seed, index, epoch)
-            return augmentation.augment(self.transforms, images[index], labels[index], seed)
-        return tuple(array[index] for array in self.sets[number])
 
     def dataset(self) -> tf.data.Dataset:
         """Return the batches as a `tf.data.Dataset` of float images and one-hot masks.
@@ -200,7 +195,6 @@ def made_from(model: Any, batches: Batches, validation: Batches) -> dict[str, An
         "pixels": [zlib.crc32(np.ascontiguousarray(array).data) for array in arrays],
         "batch_size": batches.batch_size,
         "seed": batches.seed,
-        "fresh_augmentation": batches.transforms and A.to_dict(batches.transforms),
     }
 
 
@@ -264,6 +258,22 @@ class ResumableTraining(keras.callbacks.Callback):
         """Move the progress bar."""
         self._bar.update()
 
+    def on_test_end(self, logs: Any = None) -> None:
+        """Stop if the validation loss is not finite, before anything of the epoch is written.
+
+        Raises InputError.
+        """
+        loss = float((logs or {}).get("loss", 0))
+        if not np.isfinite(loss):
+            self._bar.close()
+            kept = "no network was written"
+            if self.rows:
+                kept = f"the best network of the {len(self.rows)} epochs before is kept"
+            raise InputError(
+                f"{self.folder}: the loss of epoch {self.batches.epoch + 1} is {loss:g}, so the training has "
+                f"stopped, and {kept}; try a smaller learning rate or another loss"
+            )
+
     def on_epoch_end(self, epoch: int, logs: Any = None) -> None:
         """Write the history and the checkpoint."""
         self.rows.append({"epoch": epoch + 1} | {name: float(logs[name]) for name in logs})
@@ -297,8 +307,8 @@ def load_model(path: str | Path) -> Any:
 
     Code in the file is never executed: Keras' safe mode refuses it, and all layers that are not
     Keras' own. The classes may be any up to 256; those of the thesis's network are Cityscapes' ids.
-    Raises InputError if the file is missing, truncated, no model, or holds code, and if the network
-    does not map images of one size to a class for each pixel.
+    Raises InputError if the file is missing, truncated, no model, or holds code, if its weights are
+    not finite, and if the network does not map images of one size to a class for each pixel.
     """
     if Path(path).is_dir():
         raise InputError(
@@ -324,6 +334,11 @@ def load_model(path: str | Path) -> Any:
         raise InputError(
             f"{path}: a model from {inputs} to {outputs}; expected (None, height, width, 1 or 3) to "
             "(None, height, width, classes), so name another model"
+        )
+    if not all(np.isfinite(weights).all() for weights in model.get_weights()):
+        raise InputError(
+            f"{path}: has weights that are no finite numbers, because its training broke; train it again, "
+            "or name another model"
         )
     return same_bits(model)
 

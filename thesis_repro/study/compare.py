@@ -13,7 +13,7 @@ A ratio is formed in three steps:
    that of the reference. Half and double are then equally far from 1, which is not so for
    percentages. Every run counts with its own errors, also one that failed.
 2. The ratio is the Hodges-Lehmann estimate over the sequences: the median of the means of all pairs
-   of logarithms. One sequence on which a method fails hardly moves it.
+   of logarithms. One sequence on which a method fails moves it less than it moves a mean.
 3. Its interval is that of Wilcoxon's signed-rank test, which is exact. It estimates how far the
    ratio could be off if other sequences of the same kind had been recorded.
 
@@ -21,7 +21,7 @@ The verdict is "lower" or "higher" if the interval excludes 1, and otherwise "no
 With fewer than MIN_SEQUENCES sequences it is "too few sequences to tell". `primary_comparison`
 selects the rows that answer the main question.
 
-How often a method fails is a question of its own, because the ratio hardly sees it. A run has
+How often a method fails is a question of its own, which the ratio does not answer. A run has
 failed if one of its steps has, or if it is lost (`metrics.step_errors`). `failures` counts such
 runs, and compares their shares by a sign test over the sequences.
 
@@ -49,8 +49,14 @@ from thesis_repro.study.methods import MASK_CONTROLS
 
 # {name: title} of the methods and errors that are compared. The judging metrics decide (see
 # `primary_comparison`).
-METHODS = {name: method.title for name, method in methods.METHODS.items() if method.is_compared}
-SEGMENTATION_FREE_CONTROLS = [name for name, method in methods.METHODS.items() if method.is_control]
+METHODS = {
+    name: method.title
+    for name, method in methods.METHODS.items()
+    if method.group != methods.THESIS_ONLY
+}
+SEGMENTATION_FREE_CONTROLS = [
+    name for name, method in methods.METHODS.items() if method.group == methods.CONTROL
+]
 METRICS = {name: error.title for name, error in ERRORS.items()}
 JUDGING_METRICS = {name: error.title for name, error in ERRORS.items() if error.decides}
 
@@ -287,7 +293,8 @@ def _variants(
             ["source", "dilation_width"], dropna=False, sort=False
         )
         for (source, width), rows in by_width:
-            tested = pd.isna(width) or width == tested_width(of_source(runs, source))
+            tested_at = tested_width(of_source(runs, source))
+            tested = pd.isna(width) or tested_at in (None, width)
             columns = {
                 "source": source,
                 "method": method,

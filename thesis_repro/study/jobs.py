@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from thesis_repro.data.kitti import Sequence
-from thesis_repro.odometry import THESIS, OdometrySettings, estimators
-from thesis_repro.study.methods import MASK_CONTROLS, METHODS, OF_LABEL_MAPS, true_labels
+from thesis_repro.odometry import OdometrySettings, estimators
+from thesis_repro.study.methods import MASK_CONTROLS, OF_LABEL_MAPS, true_labels
 from thesis_repro.study.sources import UNMASKED, Source
 
 # Pixels: the dilation width of Section 3.6 and Figures 3.6 and 4.5, at which masks are tested. It
@@ -40,7 +40,7 @@ class Job:
     masks that leave as many keypoints. source: name of the source of the masks, or of the masks
     that gave the number of keypoints; empty if there is only one source. max_keypoints,
     min_distance (pixels): limits of the detector.
-    estimator: "thesis" or "refined", see OdometrySettings.
+    estimator: one of estimators.ESTIMATORS.
     repetition: 0 is the thesis's single run; any other number is the seed that shuffles the matched
     points.
     """
@@ -61,9 +61,9 @@ class Job:
         Examples: masked-05-0, mine/mirrored-10-refined-1, spread-7.5-0.
         """
         parts = [self.method]
-        if self.dilation_width is not None and METHODS[self.method].has_masks:
-            parts.append(f"{self.dilation_width:02d}")
         limits = (self.max_keypoints, self.min_distance)
+        if self.dilation_width is not None and limits == (None, None):
+            parts.append(f"{self.dilation_width:02d}")
         parts += [f"{limit:g}" for limit in limits if limit is not None]
         if self.estimator != "thesis":
             parts.append(self.estimator)
@@ -73,18 +73,16 @@ class Job:
             return f"{self.source}/{name}"
         return name
 
-    @property
-    def settings(self) -> OdometrySettings:
-        """The thesis's settings of the odometry, with the changes that the job asks for."""
+    def changed(self, settings: OdometrySettings) -> OdometrySettings:
+        """Return settings of the odometry with the changes that the job asks for."""
         changes: dict[str, Any] = {
-            "estimator": self.estimator,
+            "estimator": estimators.ESTIMATORS[self.estimator].make,
             "max_keypoints": self.max_keypoints,
             "min_distance": self.min_distance,
             "shuffle_seed": self.repetition or None,
         }
-        return replace(
-            THESIS, **{name: value for name, value in changes.items() if value is not None}
-        )
+        given = {name: value for name, value in changes.items() if value is not None}
+        return replace(settings, **given)
 
 
 def first_jobs(
@@ -117,8 +115,8 @@ def first_jobs(
                 job = Job(sequence.name, source.kind, source=source.name)
                 jobs += repeated([job], widths, times)
                 continue
-            widths_of_source: list[Any] = [None]  # of ready-made masks
-            if source.has_label_maps:
+            widths_of_source: list[Any] = [None]  # of masks without a width
+            if source.has_width:
                 widths_of_source = sorted(all_widths)
             for width in widths_of_source:
                 job = Job(sequence.name, "masked", width, source=source.name)
@@ -135,17 +133,21 @@ def first_jobs(
 
 def _control_jobs(sequence: Sequence, source: Source, tested: int) -> list[Job]:
     """Return the controls that are masks, as far as a source and a sequence allow them."""
-    left_out: tuple[str, ...] = ()
-    width: int | None = tested
-    if not source.has_label_maps:
-        left_out, width = OF_LABEL_MAPS, None
-    elif not true_labels(sequence.root, sequence.name).is_dir():
-        left_out = ("true-labels",)
+    width = tested if source.has_width else None
+    widths: dict[str, int | None] = dict.fromkeys(MASK_CONTROLS, width)
+    widths |= dict.fromkeys(OF_LABEL_MAPS, tested)
     return [
         Job(sequence.name, method, width, source=source.name)
-        for method in MASK_CONTROLS
-        if method not in left_out
+        for method, width in widths.items()
+        if is_possible(method, source, sequence)
     ]
+
+
+def is_possible(method: str, source: Source, sequence: Sequence) -> bool:
+    """Return whether a source and a sequence have what a method with masks needs."""
+    if method == "true-labels" and not true_labels(sequence.root, sequence.name).is_dir():
+        return False
+    return source.has_label_maps or method not in OF_LABEL_MAPS
 
 
 def repeated(jobs: Iterable[Job], estimators: Iterable[str], repetitions: int) -> list[Job]:

@@ -8,18 +8,17 @@ entry in METHODS, a new error of a path one in study/errors.py.
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import cv2
 import numpy as np
 
 from thesis_repro.data.kitti import TRUE_LABELS, Sequence
 from thesis_repro.masks import MaskSettings, dilate
-from thesis_repro.odometry import THESIS
+from thesis_repro.odometry import THESIS, OdometrySettings
 from thesis_repro.odometry.odometry import detect
-from thesis_repro.study.sources import FileMasks, Source
+from thesis_repro.study.sources import Source
 
 # Masks that are controls. They are indexed by frame number, as in `masks`.
 
@@ -53,6 +52,10 @@ class OtherFrame:
 
     def __len__(self) -> int:
         return len(self.masks)
+
+    def check_files(self, known: set[Any]) -> None:
+        """Raise InputError if a file of the source is damaged, see `LabelMasks.check_files`."""
+        self.masks.check_files(known)
 
     def __getitem__(self, index: int) -> np.ndarray:
         count = len(self)
@@ -137,78 +140,101 @@ class ImageEdges(OtherFrame):
         return best
 
 
-ControlMasks: TypeAlias = FileMasks | OtherFrame
+# The methods: functions of a sequence, a source and a width of its masks in pixels
+
+Choice: TypeAlias = tuple[OdometrySettings, Any]  # settings and masks of a run, or None
 
 
-# The methods
+def all_keypoints(sequence: Sequence, source: Source, width: int | None) -> Choice:
+    """Run as the thesis does, without masks."""
+    return THESIS, None
+
+
+def masked(sequence: Sequence, source: Source, width: int | None) -> Choice:
+    """Run with the masks of the source."""
+    return THESIS, source.masks(sequence, width)
+
+
+def brought(sequence: Sequence, source: Source, width: int | None) -> Choice:
+    """Run with what the source brings in place of the odometry or parts of it."""
+    return THESIS, source
+
+
+def altered(masks: type[OtherFrame]) -> Callable[..., Choice]:
+    """Return a method with masks that are made from those of the source."""
+    return lambda sequence, source, width: (THESIS, masks(source, sequence, width))
+
+
+def made_with(settings: MaskSettings | None = None, **changes: Any) -> Callable[..., Choice]:
+    """Return a method with other masks from the same label maps.
+
+    settings: of the masks; None: those of the source, with changes.
+    """
+
+    def choose(sequence: Sequence, source: Source, width: int | None) -> Choice:
+        ids = source.settings.ids
+        chosen = replace(settings or source.settings, **{"ids": ids, **changes})
+        return masked(sequence, replace(source, settings=chosen), width)
+
+    return choose
+
+
+def from_true_labels(sequence: Sequence, source: Source, width: int | None) -> Choice:
+    """Run with masks from the true label maps."""
+    folder = true_labels(sequence.root, sequence.name)
+    settings = replace(source.settings, ids="labels")
+    return masked(sequence, replace(source, folder=folder, settings=settings), width)
 
 
 class Method(NamedTuple):
     """A way to choose the keypoints of a run.
 
-    title: in tables and figures. altered: the masks of the source, changed. settings: from the
-    source's mask settings to those of the method, for other masks from the same label maps.
-    has_masks: whether keypoints are found inside a mask. is_control: a control without
-    segmentation, which keeps as many keypoints as the masks do but knows nothing of the classes.
-    is_compared: in `compare.comparisons`.
+    title: in tables and figures. group: REFERENCE, BROUGHT by the user, from LABEL_MAPS of the
+    user, a CONTROL without segmentation, which keeps as many keypoints as the masks do but knows
+    nothing of the classes, or THESIS_ONLY, for a figure of the thesis. choose: from a sequence, a
+    source and a width to the settings and masks of a run.
     """
 
     title: str
-    altered: type[OtherFrame] | None = None
-    settings: Callable[[MaskSettings], MaskSettings] | None = None
-    has_masks: bool = True
-    is_control: bool = False
-    is_compared: bool = True
+    group: str
+    choose: Callable[[Sequence, Source, int | None], Choice]
 
 
+REFERENCE, BROUGHT, LABEL_MAPS, CONTROL, THESIS_ONLY = (
+    "reference",
+    "brought",
+    "label maps",
+    "control",
+    "thesis",
+)
 METHODS = {  # in the order in which they are shown
-    "baseline": Method("all keypoints", has_masks=False),
-    "masked": Method("masks"),
-    "keypoints": Method("own keypoints", has_masks=False),  # these two as sources.KINDS has them
-    "paths": Method("path of another system", has_masks=False),
+    "baseline": Method("all keypoints", REFERENCE, all_keypoints),
+    "masked": Method("masks", BROUGHT, masked),
+    "keypoints": Method("own keypoints", BROUGHT, brought),  # these two as sources.KINDS has them
+    "paths": Method("path of another system", BROUGHT, brought),
     "exact-boundaries": Method(
-        "exact class boundaries", settings=partial(replace, boundaries="exact", keep="boundaries")
+        "exact class boundaries", LABEL_MAPS, made_with(boundaries="exact", keep="boundaries")
     ),
-    "corrected": Method(
-        "corrected mask", settings=lambda settings: replace(CORRECTED, ids=settings.ids)
-    ),
-    # as SLAM systems use a segmentation, see masks.KEEP
+    "corrected": Method("corrected mask", LABEL_MAPS, made_with(CORRECTED)),
     "static-boundaries": Method(
-        "boundaries of static things", settings=partial(replace, keep="static-boundaries")
+        "boundaries of static things", LABEL_MAPS, made_with(keep="static-boundaries")
     ),
-    "static": Method("all but movable things", settings=partial(replace, keep="static")),
-    "inverse": Method("all but the boundaries", settings=partial(replace, keep="inverse")),
-    "true-labels": Method("true label maps", settings=partial(replace, ids="labels")),
-    "other-frame": Method("mask of another frame", OtherFrame, is_control=True),
-    "mirrored": Method("mirrored mask", Mirrored, is_control=True),
-    "random-lines": Method("random lines", RandomLines, is_control=True),
-    "image-edges": Method("edges of the image", ImageEdges, is_control=True),
-    "fewer": Method("fewer keypoints", has_masks=False, is_control=True),
-    "spread": Method("keypoints spread out", has_masks=False, is_control=True),
-    "reduced": Method("reduced keypoints", has_masks=False, is_compared=False),  # Figure 4.12
+    "static": Method("all but movable things", LABEL_MAPS, made_with(keep="static")),
+    "inverse": Method("all but the boundaries", LABEL_MAPS, made_with(keep="inverse")),
+    "true-labels": Method("true label maps", LABEL_MAPS, from_true_labels),
+    "other-frame": Method("mask of another frame", CONTROL, altered(OtherFrame)),
+    "mirrored": Method("mirrored mask", CONTROL, altered(Mirrored)),
+    "random-lines": Method("random lines", CONTROL, altered(RandomLines)),
+    "image-edges": Method("edges of the image", CONTROL, altered(ImageEdges)),
+    # these two as many keypoints as masks leave, which the job says
+    "fewer": Method("fewer keypoints", CONTROL, all_keypoints),
+    "spread": Method("keypoints spread out", CONTROL, all_keypoints),
+    "reduced": Method("reduced keypoints", THESIS_ONLY, all_keypoints),  # Figure 4.12
 }
 AS_SLAM_SYSTEMS = ("static", "inverse", "static-boundaries")
 OF_LABEL_MAPS = ("exact-boundaries", "corrected", *AS_SLAM_SYSTEMS, "true-labels")
 # the methods with masks beside "masked", in the order of their runs
 MASK_CONTROLS = ("other-frame", "mirrored", "random-lines", "image-edges", *OF_LABEL_MAPS)
-
-
-def masks_of_method(
-    name: str, source: Source, sequence: Sequence, dilation_width: int | None
-) -> ControlMasks:
-    """Return the masks of a sequence for a method that has masks.
-
-    source: of the masks that a control is compared with. dilation_width: pixels, for masks from
-    label maps.
-    """
-    method = METHODS[name]
-    if method.altered:
-        return method.altered(source, sequence, dilation_width)
-    if method.settings:
-        source = replace(source, settings=method.settings(source.settings))
-    if name == "true-labels":
-        source = replace(source, folder=true_labels(sequence.root, sequence.name))
-    return source.masks(sequence, dilation_width)
 
 
 def min_distance(sequence: Sequence, number: float) -> float:
@@ -218,11 +244,11 @@ def min_distance(sequence: Sequence, number: float) -> float:
     of the sequence, and is never below the distance of the thesis.
     """
     sample = np.unique(np.linspace(0, len(sequence) - 1, SAMPLE).round().astype(int))
-    frames = [sequence.frame(index) for index in sample]
+    frames = [(sequence.frame(index), sequence.visible(index)) for index in sample]
 
     def mean_number(distance: float) -> float:
         settings = replace(THESIS, min_distance=distance)
-        return float(np.mean([len(detect(frame, settings)) for frame in frames]))
+        return float(np.mean([len(detect(frame, settings, visible)) for frame, visible in frames]))
 
     low, high = 0, round(min(sequence.size) / STEP)
     distances = [round(THESIS.min_distance + step * STEP, 6) for step in range(high)]

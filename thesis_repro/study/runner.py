@@ -1,15 +1,16 @@
-"""Run the jobs of a study that have no result yet, and make the table of all runs.
+"""The one runner: it makes the runs that have no result yet, and the table of all runs.
 
 They run here or on a cluster. Each finished run is one CSV file with one row a frame, and is not
-run again.
+run again. Errors are computed from these files.
 """
 
+import json
 import textwrap
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import cv2
 import numpy as np
@@ -18,19 +19,14 @@ import pandas as pd
 from thesis_repro import odometry
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
+from thesis_repro.odometry import THESIS, OdometrySettings
 from thesis_repro.odometry.runs import is_flagged, poses_of
 from thesis_repro.running import messages, results
 from thesis_repro.running.files import listed, progress, write_text
 from thesis_repro.study import compare
 from thesis_repro.study.errors import path_errors
 from thesis_repro.study.jobs import ESTIMATORS, Job, in_passes, repeated
-from thesis_repro.study.methods import (
-    METHODS,
-    ControlMasks,
-    masks_of_method,
-    min_distance,
-    true_labels,
-)
+from thesis_repro.study.methods import METHODS, min_distance, true_labels
 from thesis_repro.study.sources import UNMASKED, Source, by_name
 from thesis_repro.study.workers import open_pool
 
@@ -46,12 +42,13 @@ CODE = (
     "thesis_repro.study.methods",
     "thesis_repro.study.sources",
 )
+SETTINGS = "settings.json"  # of the runs in a folder
 READERS = ("thesis_repro.odometry.metrics",)  # read poses: a change of them repeats no run
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What `run_jobs` did.
+    """What `run_all` did.
 
     table: all runs that succeeded, one row a job. made, kept, failed_jobs: numbers of jobs that
     were run now, that had a result from before, and that failed. warnings: lines that say why they
@@ -65,9 +62,61 @@ class Outcome:
     warnings: list[str]
 
 
-def result_file(folder: Path, job: Job) -> Path:
+def _file(folder: Path, job: Job) -> Path:
     """Return the result file of a job, which is written when the job is done."""
     return folder / job.sequence / f"{job.name}.csv"
+
+
+Run: TypeAlias = tuple[Sequence, OdometrySettings, Any]
+
+
+def run_all(
+    runs: Mapping[Job, Run],
+    folder: Path,
+    *,
+    made_from: Mapping[str, Mapping[str, Any]] = {},
+    failed: Mapping[Job, str] = {},
+    processes: int = 1,
+    scheduler: str | None = None,
+) -> Outcome:
+    """Run what has no result yet; returns the table of all runs and how many ran.
+
+    runs: {job: (sequence, settings, masks)}. masks: None, `Masks`, or an object with a function
+    `run(sequence, settings)` in place of the odometry.
+    folder: for the results, one file a run. Results from other data or code in it are moved aside,
+    and runs with other settings are made again. made_from: what the masks of a sequence come from,
+    {sequence: inputs} or {sequence/source: inputs}, see `results.stage`. failed: reasons of jobs
+    that cannot run.
+    processes, scheduler: see `workers.open_pool`; the results do not depend on them. The workers of
+    a scheduler need this package, and all folders under the same paths. One thread a worker is
+    best.
+
+    Runs over the same sequence share one or several passes (`odometry.run_many`), with the results
+    of separate runs. What is stopped repeats only the passes that it was in. A run that fails is
+    printed with its reason and does not stop others.
+    Raises InputError if another process is using the folder, if all runs fail, or if a worker is
+    lost.
+    """
+    sequences = {sequence.name: sequence for sequence, _, _ in runs.values()}
+    with results.claimed(folder):
+        for sequence in sequences.values():
+            _stage(folder, sequence, made_from)
+            _drop_changed(runs, folder / sequence.name)
+        waiting = {job: run for job, run in runs.items() if not _file(folder, job).is_file()}
+        reasons = {**failed, **_run_passes(waiting, sequences, folder, processes, scheduler)}
+    warnings = _report(reasons)
+    rows = []
+    for job, (sequence, _, _) in runs.items():
+        path = _file(folder, job)
+        if path.is_file():
+            numbers = _measures_of_file(path, path.stat().st_mtime_ns, sequence)
+            rows.append({"sequence": job.sequence, "run": job.name, **asdict(job), **numbers})
+    total = len(runs) + len(failed)
+    if not rows:
+        first = next(iter(reasons.values()))
+        raise InputError(f"all {total} odometry runs failed; the first: {first}")
+    kept = len(runs) - len(waiting)
+    return Outcome(pd.DataFrame(rows), len(rows) - kept, kept, total - len(rows), warnings)
 
 
 def run_jobs(
@@ -76,56 +125,63 @@ def run_jobs(
     sources: Path | Iterable[Source],
     folder: Path,
     *,
-    processes: int = 1,
-    scheduler: str | None = None,
-    scale_gate: float = odometry.THESIS.scale_gate,
+    scale_gate: float = THESIS.scale_gate,
     masked_settings: Mapping[str, Any] = {},
+    **workers: Any,
 ) -> Outcome:
-    """Run the jobs that have no result yet; returns the table of all runs and how many ran.
+    """Run the jobs of a study that have no result yet, see `run_all`.
 
     sequences: those of the jobs. sources: folder with one folder of label maps a sequence, or the
-    sources of the jobs.
-    folder: for the results; results from other data, code or mask settings in it are moved aside.
-    processes, scheduler: see `workers.open_pool`; the results do not depend on them. The workers of
-    a scheduler need this package, and the three folders under the same paths. One thread a worker
-    is best. scale_gate: metres, of all runs, see OdometrySettings. masked_settings: other settings
-    of the runs with masks.
-
-    Jobs over the same sequence share one or several passes (`odometry.run_many`), with the results
-    of separate runs. A stopped study repeats only the passes that it was in. A job that fails is
-    printed with its reason and does not stop other jobs.
-    Raises InputError if another run is using the folder, if all jobs fail, or if a worker is lost.
+    sources of the jobs. scale_gate: metres, of all runs, see OdometrySettings. masked_settings:
+    other settings of the runs with masks.
     """
     jobs = list(dict.fromkeys(jobs))
     sources_by_name = by_name(sources)
     names = {job.sequence for job in jobs}
     opened = {sequence.name: sequence for sequence in sequences if sequence.name in names}
-    with results.claimed(folder):
-        for sequence in opened.values():
-            _stage(folder, sequence, sources_by_name)
-        waiting = _unfinished(jobs, folder)
-        reasons = _run_passes(
-            waiting,
-            opened,
-            sources_by_name,
-            folder,
-            processes,
-            scheduler,
-            scale_gate,
-            masked_settings,
-        )
-    warnings = _report(reasons)
-    rows = []
+    made_from: dict[str, dict[str, Any]] = {}
+    for name, sequence in opened.items():
+        true_maps = listed(true_labels(sequence.root, name))
+        made_from[name] = {"true_labels": results.digest_of_files(true_maps)}
+        for source in sources_by_name.values():
+            place = f"{name}/{source.name}" if source.name else name
+            made_from.setdefault(place, {}).update(source.record(name))
+    runs, failed = chosen(jobs, opened, sources_by_name)
+    for job, (sequence, settings, masks) in runs.items():
+        settings = replace(settings, scale_gate=scale_gate)
+        if masks is not None and job.method not in UNMASKED:
+            settings = replace(settings, **masked_settings)
+        runs[job] = sequence, settings, masks
+    return run_all(runs, folder, made_from=made_from, failed=failed, **workers)
+
+
+def chosen(
+    jobs: Iterable[Job], sequences: Mapping[str, Sequence], sources: Mapping[str, Source]
+) -> tuple[dict[Job, Run], dict[Job, str]]:
+    """Return {job: run} for `run_all`, and {job: reason} for masks that cannot be made.
+
+    Jobs with the same masks get the same object, by which `run_many` recognises that they share
+    work.
+    """
+
+    @cache
+    def choose(method: str, sequence: str, source: str, width: int | None) -> Any:
+        try:
+            given = sources.get(source) or next(iter(sources.values()))
+            return METHODS[method].choose(sequences[sequence], given, width)
+        except InputError as error:
+            return str(error)
+
+    runs: dict[Job, Run] = {}
+    reasons = {}
     for job in jobs:
-        path = result_file(folder, job)
-        if path.is_file():
-            numbers = _measures_of_file(path, path.stat().st_mtime_ns, opened[job.sequence])
-            rows.append({"sequence": job.sequence, "run": job.name, **asdict(job), **numbers})
-    if not rows:
-        first = next(iter(reasons.values()))
-        raise InputError(f"all {len(jobs)} odometry runs failed; the first: {first}")
-    kept = len(jobs) - len(waiting)
-    return Outcome(pd.DataFrame(rows), len(rows) - kept, kept, len(jobs) - len(rows), warnings)
+        choice = choose(job.method, job.sequence, job.source, job.dilation_width)
+        if isinstance(choice, str):
+            reasons[job] = choice
+        else:
+            settings, masks = choice
+            runs[job] = sequences[job.sequence], job.changed(settings), masks
+    return runs, reasons
 
 
 @cache  # a study calls `run_jobs` again, with more jobs
@@ -153,7 +209,7 @@ def keypoint_controls(
     jobs: list[Job] = []
     for source in sources:
         keypoints = compare.keypoints_left(compare.of_source(runs, source.name))
-        width_of_source = width if source.has_label_maps else None
+        width_of_source = width if source.has_width else None
         for sequence in sequences:
             if sequence.name not in keypoints:  # its runs with masks failed
                 continue
@@ -168,16 +224,13 @@ def keypoint_controls(
 
 
 def _run_passes(
-    jobs: list[Job],
+    runs: dict[Job, Run],
     sequences: dict[str, Sequence],
-    sources: dict[str, Source],
     folder: Path,
     processes: int,
     scheduler: str | None,
-    scale_gate: float,
-    masked_settings: Mapping[str, Any],
 ) -> dict[Job, str]:
-    """Run jobs; returns which of them failed, and why."""
+    """Make runs; returns which of them failed, and why."""
 
     def frames(pass_jobs: Iterable[Job]) -> int:
         return sum(len(sequences[job.sequence]) for job in pass_jobs)
@@ -185,13 +238,12 @@ def _run_passes(
     reasons: dict[Job, str] = {}
     with open_pool(processes, scheduler) as pool:
         calls = []
-        for pass_jobs in in_passes(jobs, sequences, pool.size):
+        for pass_jobs in in_passes(runs, sequences, pool.size):
             sequence = sequences[pass_jobs[0].sequence]
             record = results.record(folder / sequence.name)
-            calls.append(
-                (pass_jobs, sequence, sources, folder, record, scale_gate, masked_settings)
-            )
-        with progress(None, "odometry", total=frames(jobs), unit="frame") as bar:
+            pass_runs = {job: runs[job][1:] for job in pass_jobs}
+            calls.append((pass_runs, sequence, folder, record))
+        with progress(None, "odometry", total=frames(runs), unit="frame") as bar:
             for pass_jobs, pass_reasons in pool.run(_run_pass, calls):
                 reasons |= pass_reasons
                 bar.update(frames(pass_jobs))
@@ -205,14 +257,14 @@ def _report(reasons: Mapping[Job, str]) -> list[str]:
         by_reason.setdefault((job.sequence, reason), []).append(job.name)
     lines = []
     for (name, reason), runs in by_reason.items():
-        shown = textwrap.shorten(", ".join(runs), 80, placeholder=", ...")
+        shown = textwrap.shorten(", ".join(runs), 80, placeholder=" ...")
         lines.append(f"sequence {name}, {shown}: failed: {reason}")
         messages.log.warning(lines[-1])
     return lines
 
 
-def _stage(folder: Path, sequence: Sequence, sources: dict[str, Source]) -> None:
-    """Move aside the results of a sequence that were made from other data, code or settings.
+def _stage(folder: Path, sequence: Sequence, made_from: Mapping[str, Mapping[str, Any]]) -> None:
+    """Move aside the results of a sequence that were made from other data or code.
 
     Each source has a subfolder, so a change of one source does not move the runs of other
     sources.
@@ -222,18 +274,32 @@ def _stage(folder: Path, sequence: Sequence, sources: dict[str, Source]) -> None
             f"{sequence.poses_path}: no such file; without ground truth, sequence {sequence.name} has no "
             "errors to compare; leave it out (the odometry command runs it)"
         )
-    folder /= sequence.name
-    true_maps = listed(true_labels(sequence.root, sequence.name))
-    records = {source.name: source.record(sequence.name) for source in sources.values()}
     results.stage(
-        folder,
+        folder / sequence.name,
         **_versions(),
         sequence=results.digest_of_files(sequence.files),
-        true_labels=results.digest_of_files(true_maps),
-        **records.pop("", {}),
+        **made_from.get(sequence.name, {}),
     )
-    for source, record in records.items():
-        results.stage(folder / source, **record)
+    for place, inputs in made_from.items():
+        if place.startswith(f"{sequence.name}/"):
+            results.stage(folder / place, **inputs)
+
+
+def _drop_changed(runs: Mapping[Job, Run], folder: Path) -> None:
+    """Delete the results of runs of a sequence that were made with other settings."""
+    now = {
+        job.name: settings.record()
+        for job, (_, settings, _) in runs.items()
+        if job.sequence == folder.name
+    }
+    now = json.loads(json.dumps(now, default=float))  # numbers of numpy
+    path = folder / SETTINGS
+    before = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    for name, settings in now.items():
+        if before.get(name, settings) != settings:
+            (folder / f"{name}.csv").unlink(missing_ok=True)
+    if before | now != before:
+        write_text(path, json.dumps(before | now, indent=1))
 
 
 def _versions() -> dict[str, Any]:
@@ -243,48 +309,12 @@ def _versions() -> dict[str, Any]:
     }
 
 
-def checked_masks(
-    jobs: Iterable[Job], sequence: Sequence, sources: Mapping[str, Source]
-) -> tuple[dict[Job, ControlMasks | None], dict[Job, str]]:
-    """Return {job: masks} over a sequence, and {job: reason} for masks that cannot be made.
-
-    The masks are None for jobs without masks. Every file is read here, because a bad file in the
-    middle of a pass would stop the whole pass. Jobs with the same masks get the same object, by
-    which `run_many` recognises that they share work.
-    """
-    check = cache(Source.check_file)  # several masks are made from one file
-
-    @cache
-    def checked(method: str, source_name: str, width: int | None) -> ControlMasks:
-        masks = masks_of_method(method, sources[source_name], sequence, width)
-        for path in masks.paths:
-            check(sources[source_name], path, sequence.size)
-        return masks
-
-    masks_by_job: dict[Job, ControlMasks | None] = {}
-    reasons = {}
-    for job in jobs:
-        try:
-            masks_by_job[job] = None
-            if METHODS[job.method].has_masks:
-                masks_by_job[job] = checked(job.method, job.source, job.dilation_width)
-        except InputError as error:
-            del masks_by_job[job]
-            reasons[job] = str(error)
-    return masks_by_job, reasons
-
-
 def _run_pass(
-    jobs: list[Job],
-    sequence: Sequence,
-    sources: dict[str, Source],
-    folder: Path,
-    record: dict,
-    scale_gate: float,
-    masked_settings: Mapping[str, Any] = {},
+    runs: dict[Job, tuple[OdometrySettings, Any]], sequence: Sequence, folder: Path, record: dict
 ) -> tuple[list[Job], dict[Job, str]]:
-    """Run jobs of one sequence in one pass, here or on another machine.
+    """Make runs over one sequence in one pass, here or on another machine.
 
+    Every file of masks is read first, because a bad file in the middle would stop the whole pass.
     record: of the sequence's results, as the main process sees it. Returns the jobs, and the
     reasons of those that failed.
     """
@@ -293,40 +323,36 @@ def _run_pass(
     cv2.setNumThreads(1)  # the processes already use every core
     try:
         results.check_worker(folder / sequence.name, record, **_versions())
-        masks_by_job, reasons = checked_masks(_unfinished(jobs, folder), sequence, sources)
-        runs = {}
-        for job, masks in masks_by_job.items():
-            settings = replace(job.settings, scale_gate=scale_gate)
-            if masks is not None:
-                settings = replace(settings, **masked_settings)
-            runs[job.name] = settings, masks
-        if jobs[0].method in UNMASKED:
-            source = sources[jobs[0].source]
-            run_results = {name: source.run(sequence, own) for name, (own, _) in runs.items()}
-        else:
-            run_results = odometry.run_many(sequence, runs)
-        for job in masks_by_job:
-            frames = run_results[job.name].frames
+        known: set[Any] = set()
+        for job, (_, masks) in runs.items():
+            try:
+                if hasattr(masks, "check_files"):
+                    masks.check_files(known)
+            except InputError as error:
+                reasons[job] = str(error)
+        good = {job: run for job, run in runs.items() if job not in reasons}
+        brought = {job: run for job, run in good.items() if hasattr(run[1], "run")}
+        made = {job: own.run(sequence, settings) for job, (settings, own) in brought.items()}
+        if rest := {job: run for job, run in good.items() if job not in brought}:
+            made |= odometry.run_many(sequence, rest)
+        for job, result in made.items():
             # without keypoints, the path is a point, whatever the method
-            if frames["detected"].isna().all() and job.method != "paths":
+            if result.frames["detected"].isna().all() and job.method != "paths":
                 reasons[job] = (
                     f"{sequence.folder}: no frame has any structure (all are black, white or of "
                     "one gray); check how they were written"
                 )
             else:
-                write_text(result_file(folder, job), frames.to_csv(index=False))
+                write_text(_file(folder, job), result.frames.to_csv(index=False))
     except Exception as error:  # report any error as the reason, and let other passes run
         reason = str(error)
         if not isinstance(error, InputError):
-            reason = f"{type(error).__name__}: {error}"
-        reasons = dict.fromkeys(_unfinished(jobs, folder), reason) | reasons
+            reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        unfinished = [job for job in runs if not _file(folder, job).is_file()]
+        reasons = dict.fromkeys(unfinished, reason) | reasons
     finally:
         cv2.setNumThreads(threads)
-    return jobs, reasons
-
-
-def _unfinished(jobs: Iterable[Job], folder: Path) -> list[Job]:
-    return [job for job in jobs if not result_file(folder, job).is_file()]
+    return list(runs), reasons
 
 
 def measures(frames: pd.DataFrame, true: np.ndarray) -> dict[str, Any]:

@@ -2,11 +2,11 @@
 
 import re
 import runpy
-from collections.abc import Collection, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import pandas as pd
@@ -52,17 +52,21 @@ class Source:
 
     @property
     def has_label_maps(self) -> bool:
-        """Whether masks are made from label maps, so that they have a dilation width."""
+        """Whether masks are made from label maps."""
         return self.kind == "labels"
 
+    @property
+    def has_width(self) -> bool:
+        """Whether its masks have a dilation width."""
+        return self.has_label_maps and self.settings.has_width
+
     def masks(self, sequence: Sequence, dilation_width: int | None) -> FileMasks:
-        """Return the masks of a sequence. dilation_width: pixels, for masks from label maps.
+        """Return the masks of a sequence. dilation_width: pixels, for masks with a width.
 
         Raises InputError if a frame has no file.
         """
         if not self.has_label_maps:
             return MaskFolder(self.folder, sequence, self.invert)
-        assert dilation_width is not None  # masks from label maps need a width
         return LabelMasks(self.folder, sequence, dilation_width, self.settings)
 
     def check_file(self, path: Path, size: tuple[int, int]) -> None:
@@ -107,13 +111,84 @@ class Source:
 def own_calls(path: Path) -> odometry.Calls:
     """Return the odometry's calls with the functions that a Python file defines in their places.
 
-    Raises InputError if it defines none of them, and what its code raises.
+    Raises InputError if it defines none of them, and what its code raises. What its `detect` and
+    `track` return is checked in every frame.
     """
     defined = runpy.run_path(str(path))
     own = {name: defined[name] for name in odometry.Calls._fields if name in defined}
     if not own:
-        raise InputError(f"{path}: must define a function detect or track")
+        raise InputError(f"{path}: must define a function {' or '.join(odometry.Calls._fields)}")
+    if "detect" in own:
+        own["detect"] = _checked_detect(path, own["detect"])
+    if "track" in own:
+        own["track"] = _checked_track(path, own["track"])
     return odometry.OPENCV._replace(**own)
+
+
+def _checked_detect(path: Path, detect: Callable) -> Callable:
+    """Return a detector that raises InputError for keypoints that are no (u, v) of the frame."""
+
+    def checked(frame: np.ndarray, settings: Any, mask: np.ndarray | None = None) -> np.ndarray:
+        points = detect(frame, settings, mask)
+        if _kind(points) != "float32" or points.ndim != 2 or points.shape[1] != 2:
+            raise InputError(
+                f"{path}: detect returned {_described(points)}; must be float32 (N, 2), (u, v) in pixels"
+            )
+        height, width = frame.shape
+        outside = ~((points >= -1) & (points <= [width, height])).all(axis=1)  # also NaN
+        if outside.any():
+            u, v = points[outside.argmax()]
+            raise InputError(
+                f"{path}: detect returned u {u:g}, v {v:g}, outside the frame of {width}x{height} pixels; "
+                "u is the column, v the row"
+            )
+        return points
+
+    return checked
+
+
+def _checked_track(path: Path, track: Callable) -> Callable:
+    """Return a tracker that raises InputError for anything but points and booleans."""
+
+    def checked(
+        previous: np.ndarray, current: np.ndarray, points: np.ndarray, settings: Any
+    ) -> tuple[np.ndarray, np.ndarray]:
+        try:
+            tracked, was_found = track(previous, current, points, settings)
+        except TypeError as error:
+            raise InputError(f"{path}: track: {error}") from None
+        is_right = _kind(tracked) in ("float32", "float64") and tracked.shape == points.shape
+        if not is_right or _kind(was_found) != "bool" or was_found.shape != points.shape[:1]:
+            raise InputError(
+                f"{path}: track returned {_described(tracked)} and {_described(was_found)}; must be "
+                f"float32 {points.shape} and bool {points.shape[:1]}, for as many points"
+            )
+        return tracked.astype(np.float32, copy=False), was_found
+
+    return checked
+
+
+def _kind(array: Any) -> str:
+    return str(getattr(array, "dtype", ""))
+
+
+def _described(array: Any) -> str:
+    """Such as "int64 (500, 2)"."""
+    if isinstance(array, np.ndarray):
+        return f"{array.dtype} {array.shape}"
+    return type(array).__name__
+
+
+def _try(path: Path, sequence: Sequence) -> None:
+    """Run own keypoints over three frames; raise InputError for whatever their code raises."""
+    try:
+        odometry.run(sequence.subset(3), calls=own_calls(path))
+    except (InputError, OSError):
+        raise
+    except Exception as error:
+        raise InputError(
+            f"{path}: {type(error).__name__}: {' '.join(str(error).split())}"
+        ) from error
 
 
 def own_path(path: Path, sequence: Sequence) -> np.ndarray:
@@ -187,6 +262,8 @@ def check(
         if source.kind in UNMASKED:
             for sequence in sequences:
                 source.read(sequence)
+            if source.kind == "keypoints":
+                _try(source.folder, next(iter(sequences)))
             continue
         if not source.folder.is_dir():
             raise InputError(

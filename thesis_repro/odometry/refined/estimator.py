@@ -1,7 +1,6 @@
 """The refined estimator as the odometry uses it: one object that remembers the step before."""
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -13,12 +12,12 @@ from thesis_repro.odometry.types import Matches, Motion
 class RefinedEstimator:
     """The motion with the smaller rotation, fitted to all points near it and then checked."""
 
-    def __init__(self, calls: Any = None):
-        """Start before the first step. calls: not used, see odometry.Calls."""
+    def __init__(self) -> None:
+        """Start before the first step."""
         self.prior = MotionPrior.straight_ahead()
 
     def motion(self, essential: np.ndarray, matches: Matches, scale: float, moves: bool) -> Motion:
-        """Return the motion of a step (see odometry.Estimator), flagged if it is not consistent.
+        """Return the motion of a step (see types.Estimator), flagged if it is not consistent.
 
         A step that does not move the pose is not compared with the step before, and the next one is
         not compared with it.

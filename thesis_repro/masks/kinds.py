@@ -1,73 +1,24 @@
-"""The keypoint mask filter (Section 3.6, A.8): from a label map to edges to a dilated mask.
+"""Other kinds of masks than the thesis's: one table, KINDS, and the functions in it.
 
-A mask is a uint8 image of the frame's size. Keypoints are allowed where it is 255 and forbidden
-where it is 0.
+MaskSettings chooses among them; its defaults are the thesis's.
 """
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from numbers import Integral
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 
-from thesis_repro.data.cityscapes import ID, N_CLASSES, resize_bilinear
+from thesis_repro.data.cityscapes import ID, N_CLASSES
 from thesis_repro.errors import InputError
-
-CANNY = (5, 15)  # both thresholds (Section 3.6)
-
-
-def thesis_mask(label_map: np.ndarray, size: tuple[int, int], dilation_width: int) -> np.ndarray:
-    """The thesis's mask of a frame of (height, width), from a label map (h, w) of uint8 ids."""
-    edge_image = canny_edges(label_map, size)
-    return dilate(edge_image, dilation_width)
-
-
-def canny_edges(
-    label_map: np.ndarray, size: tuple[int, int], thresholds: tuple[float, float] = CANNY
-) -> np.ndarray:
-    """Edges that Canny finds in a label map, (height, width) uint8, 255 on edges.
-
-    Resizing is bilinear, which creates wrong ids along every boundary. Canny's gradients are those
-    of ids, so it finds a boundary only if the two ids differ enough. Both are the thesis's way.
-    """
-    enlarged = resize_bilinear(label_map, size)
-    return cv2.Canny(enlarged, *thresholds)
-
-
-def dilate(edge_image: np.ndarray, dilation_width: int, symmetric: bool = False) -> np.ndarray:
-    """Widen edges with a square of ones, `dilation_width` pixels a side.
-
-    A square of even width has no centre pixel, so OpenCV shifts the mask by half a pixel, as in the
-    thesis.
-    symmetric: a square of even width is made one pixel smaller. The mask is as wide as before,
-    because symmetric exact edges are two pixels wide.
-    """
-    check_width(dilation_width, edge_image.shape)
-    side = dilation_width
-    if symmetric and side % 2 == 0:
-        side -= 1
-    return cv2.dilate(edge_image, np.ones((side, side), np.uint8))
-
-
-def check_width(dilation_width: int, size: tuple[int, int]) -> None:
-    """Raise InputError if a dilation width is not possible for frames of (height, width)."""
-    limit = 2 * max(size)  # a wider square always covers the whole frame
-    if not isinstance(dilation_width, Integral) or not 1 <= dilation_width <= limit:
-        raise InputError(
-            f"dilation width {dilation_width!r}: must be a whole number from 1 to {limit} pixels for "
-            f"frames of {size[1]}x{size[0]}"
-        )
-
-
-# Other kinds of masks. MaskSettings chooses among them; its defaults are the thesis's.
+from thesis_repro.masks.filter import CANNY, canny_edges, check_width, dilate, thesis_mask
+from thesis_repro.masks.memory import remembered
 
 BOUNDARIES = ("canny", "exact")
 CLASS_EDGE_WINDOW = 5  # side in pixels: a Canny edge belongs to a boundary up to two pixels away
 MOVABLE = tuple(range(ID["person"], ID["license plate"] + 1))  # people and vehicles, parked or not
-# Where keypoints are allowed: on boundaries, as in the thesis, or as in published SLAM systems with
-# segmentation.
-KEEP = ("boundaries", "static", "inverse", "static-boundaries")
-CHOICES = {"boundaries": BOUNDARIES, "keep": KEEP}
 # pixels around movable objects that DynaSLAM excludes as well (in its Frame.cc)
 DYNASLAM_MARGIN = 15
 
@@ -76,9 +27,7 @@ DYNASLAM_MARGIN = 15
 class MaskSettings:
     """Settings of the mask filter. The defaults are the thesis's.
 
-    keep: where keypoints are allowed. "boundaries": on dilated boundaries. "inverse": everywhere
-    else. "static": everywhere except on movable objects and DYNASLAM_MARGIN around them.
-    "static-boundaries": on boundaries between two classes that cannot move.
+    keep: where keypoints are allowed, one of KINDS.
     boundaries: "canny" finds edges in label ids, as in the thesis; "exact", the correction, marks
     every change of class (see `exact_edges`).
     canny: both thresholds (Section 3.6), with OpenCV's default 3x3 Sobel operator.
@@ -104,10 +53,15 @@ class MaskSettings:
     ids: str = "labels"
     canny: tuple[float, float] = CANNY
 
+    @property
+    def has_width(self) -> bool:
+        """Whether masks of this kind are dilated."""
+        return KINDS[self.keep].has_width
+
     def __post_init__(self) -> None:
         for name in ("classes", "canny"):  # they are lists, if read from JSON
             object.__setattr__(self, name, tuple(getattr(self, name)))
-        for name, choices in CHOICES.items():
+        for name, choices in {"boundaries": BOUNDARIES, "keep": KINDS}.items():
             value = getattr(self, name)
             if value not in choices:
                 raise InputError(
@@ -121,77 +75,133 @@ class MaskSettings:
                 raise InputError(f"{name}={pixels}: must be a whole number of pixels, 0 or more")
 
 
+# Kinds of masks: functions of a label map (h, w), the frame's size, a width and settings
+
+
+def boundaries(
+    label_map: np.ndarray, size: tuple[int, int], dilation_width: int, settings: MaskSettings
+) -> np.ndarray:
+    """On dilated boundaries."""
+    return dilate(edges(label_map, size, settings), dilation_width, settings.symmetric)
+
+
+def inverse(
+    label_map: np.ndarray, size: tuple[int, int], dilation_width: int, settings: MaskSettings
+) -> np.ndarray:
+    """Everywhere but on dilated boundaries."""
+    return cv2.bitwise_not(boundaries(label_map, size, dilation_width, settings))
+
+
+def static(
+    label_map: np.ndarray, size: tuple[int, int], dilation_width: None, settings: MaskSettings
+) -> np.ndarray:
+    """Everywhere but on movable objects and, unless settings say otherwise, DYNASLAM_MARGIN."""
+    around = DYNASLAM_MARGIN if settings.movable is None else settings.movable
+    return np.where(near_movable(label_map, size, around), np.uint8(0), np.uint8(255))
+
+
+def static_boundaries(
+    label_map: np.ndarray, size: tuple[int, int], dilation_width: int, settings: MaskSettings
+) -> np.ndarray:
+    """On dilated boundaries between two classes that cannot move."""
+    return dilate(edges(label_map, size, settings, MOVABLE), dilation_width, settings.symmetric)
+
+
+class Kind(NamedTuple):
+    """A kind of mask: its function, and where it allows keypoints, for --help."""
+
+    make: Callable
+    help: str
+    has_width: bool = True  # whether masks are dilated
+
+
+# Where keypoints are allowed: on boundaries, as in the thesis, or as in published SLAM systems with
+# segmentation.
+KINDS = {
+    "boundaries": Kind(boundaries, "on boundaries"),
+    "static": Kind(static, "on all but movable things", has_width=False),
+    "inverse": Kind(inverse, "on all but boundaries"),
+    "static-boundaries": Kind(static_boundaries, "on boundaries between static classes"),
+}
+
+
 THESIS_MASKS = MaskSettings()
 
 
 def keypoint_mask(
     label_map: np.ndarray,
     size: tuple[int, int],
-    dilation_width: int,
+    dilation_width: int | None = None,
     settings: MaskSettings = THESIS_MASKS,
 ) -> np.ndarray:
     """Keypoint mask of one frame from its label map, (height, width) uint8.
 
-    Edges are dilated, inverted if `keep` says so, and the forbidden pixels are taken out.
+    dilation_width: pixels, for kinds of masks that have a width.
     Raises InputError unless the label map is (h, w) label ids.
     """
     label_map = _checked(label_map)
-    if settings == THESIS_MASKS:
+    check(dilation_width, size, settings)
+    if settings == replace(THESIS_MASKS, ids=settings.ids):
+        assert dilation_width is not None  # checked above
         return thesis_mask(label_map, size, dilation_width)
-    edge_image = edges(label_map, size, settings)
-    return finished(edge_image, forbidden(label_map, size, settings), dilation_width, settings)
-
-
-def finished(
-    edge_image: np.ndarray,
-    forbidden_pixels: np.ndarray | None,
-    dilation_width: int,
-    settings: MaskSettings,
-) -> np.ndarray:
-    """Mask of a frame from its edges and forbidden pixels, see `edges` and `forbidden`."""
-    mask = dilate(edge_image, dilation_width, settings.symmetric)
-    if settings.keep == "inverse":
-        mask = cv2.bitwise_not(mask)
-    if forbidden_pixels is not None:
-        mask[forbidden_pixels] = 0
+    mask = KINDS[settings.keep].make(label_map, size, dilation_width, settings)
+    if settings.movable is not None:
+        mask[near_movable(label_map, size, settings.movable)] = 0
+    if settings.margin:
+        inside = mask[settings.margin : -settings.margin, settings.margin : -settings.margin].copy()
+        mask[:] = 0
+        mask[settings.margin : -settings.margin, settings.margin : -settings.margin] = inside
     return mask
 
 
-def edges(
-    label_map: np.ndarray, size: tuple[int, int], settings: MaskSettings = THESIS_MASKS
-) -> np.ndarray:
-    """Edges that a mask widens, (height, width) uint8, 255 on edges; with "static", all pixels.
+def check(dilation_width: int | None, size: tuple[int, int], settings: MaskSettings) -> None:
+    """Raise InputError if a kind of mask needs another dilation width."""
+    if settings.has_width:
+        check_width(dilation_width, size)
 
-    label_map: (h, w) uint8 ids. size: (height, width) of the frame.
+
+@remembered
+def edges(
+    label_map: np.ndarray,
+    size: tuple[int, int],
+    settings: MaskSettings = THESIS_MASKS,
+    without: tuple[int, ...] = (),
+) -> np.ndarray:
+    """Edges that a mask widens, (height, width) uint8, 255 on edges.
+
+    label_map: (h, w) uint8 ids. size: (height, width) of the frame. without: ids whose boundaries
+    are left out.
     """
-    if settings.keep == "static":
-        return np.full(size, 255, np.uint8)
     if settings.boundaries == "exact":
-        return exact_edges(label_map, size, settings, settings.symmetric)
+        return exact_edges(label_map, size, settings, settings.symmetric, without)
     canny = canny_edges(label_map, size, settings.canny)
-    if settings.classes or settings.keep == "static-boundaries":
+    if settings.classes or without:
         # Canny does not know classes: keep its edges within two pixels of the chosen boundaries
-        chosen = exact_edges(label_map, size, settings, symmetric=True)
-        canny &= dilate(chosen, CLASS_EDGE_WINDOW)
+        chosen = exact_edges(label_map, size, settings, True, without)
+        canny = canny & dilate(chosen, CLASS_EDGE_WINDOW)
     return canny
 
 
 def exact_edges(
-    label_map: np.ndarray, size: tuple[int, int], settings: MaskSettings, symmetric: bool
+    label_map: np.ndarray,
+    size: tuple[int, int],
+    settings: MaskSettings,
+    symmetric: bool,
+    without: tuple[int, ...] = (),
 ) -> np.ndarray:
     """Every pixel whose right or lower neighbour has another class, (height, width) uint8.
 
     symmetric: enlarge by the nearest pixel centres and mark both sides of a boundary. OpenCV's
     plain nearest neighbour shifts the boundary by half a pixel, and so does a mark on one side.
-    With `classes` or keep="static-boundaries", only some boundaries are marked.
+    Only boundaries of the settings' classes are marked, and none of the ids `without`.
     """
     enlarged = _enlarge(label_map, size, symmetric)
     selected = np.ones(size, bool)  # one side of a boundary must be
     if settings.classes:
         selected = np.isin(enlarged, [ID[name] for name in settings.classes])
     allowed = np.ones(size, bool)  # both sides of a boundary must be
-    if settings.keep == "static-boundaries":
-        allowed = ~np.isin(enlarged, MOVABLE)
+    if without:
+        allowed = ~np.isin(enlarged, without)
     different = np.zeros(size, bool)
     for pixel, neighbour in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
         change = enlarged[pixel] != enlarged[neighbour]
@@ -203,25 +213,11 @@ def exact_edges(
     return different.astype(np.uint8) * 255
 
 
-def forbidden(
-    label_map: np.ndarray, size: tuple[int, int], settings: MaskSettings
-) -> np.ndarray | None:
-    """Pixels where keypoints are forbidden, (height, width) booleans; None if there are none.
-
-    They are movable objects and the border's margin.
-    """
-    movable, margin = settings.movable, settings.margin
-    if settings.keep == "static" and movable is None:
-        movable = DYNASLAM_MARGIN
-    if movable is None and not margin:
-        return None
-    height, width = size
-    is_forbidden = np.ones(size, bool)
-    is_forbidden[margin : height - margin, margin : width - margin] = False
-    if movable is not None:
-        moving = _enlarge(np.isin(label_map, MOVABLE).astype(np.uint8), size, True)
-        is_forbidden |= dilate(moving, 2 * movable + 1) > 0
-    return is_forbidden
+@remembered
+def near_movable(label_map: np.ndarray, size: tuple[int, int], pixels: int) -> np.ndarray:
+    """Whether each pixel is on people or vehicles or so near them, (height, width) booleans."""
+    moving = _enlarge(np.isin(label_map, MOVABLE).astype(np.uint8), size, True)
+    return dilate(moving, 2 * pixels + 1) > 0
 
 
 def _checked(label_map: np.ndarray) -> np.ndarray:
@@ -256,8 +252,3 @@ def boundaries_found(mask: np.ndarray, true_labels: np.ndarray) -> float:
     if not true.any():
         return np.nan
     return float((mask[true] > 0).mean())
-
-
-def coverage(mask: np.ndarray) -> float:
-    """Share of the frame that the mask keeps, 0 to 1."""
-    return float(np.count_nonzero(mask)) / mask.size

@@ -1,0 +1,51 @@
+"""The table of all choices: streets as units, and one rule for everybody."""
+
+from itertools import product
+
+import pandas as pd
+
+import choices
+from thesis_repro.study import jobs
+from thesis_repro.study.jobs import ESTIMATORS
+
+
+def test_one_standard_counts_streets_and_asks_rule_5_of_every_choice():
+    streets = [f"{number:02d}" for number in range(8)]
+    rows = []
+    for street, estimator, method in product(
+        streets, ESTIMATORS, ("baseline", "masked", "inverse")
+    ):
+        for repetition in range(4):
+            row = {"sequence": street, "estimator": estimator, "method": method, "lost": 0}
+            row |= {"dilation_width": jobs.CONTROL_WIDTH, "mean_keypoints": 800, "failed": 0}
+            row |= {"se3": 1.0, "rotation": 0.1}
+            if method == "masked":  # half of the runs fail on one street, a quarter on another
+                row["lost"] = int(repetition < {"03": 2, "04": 1}.get(street, 0))
+            rows.append(row)
+    runs = pd.DataFrame(rows)
+    few_runs = pd.DataFrame(columns=["sequence", "choice", "number", "estimator", "failed"])
+    worths = pd.DataFrame(
+        {
+            "sequence": street,
+            "choice": choice,
+            "number": 400,
+            "split": split,
+            "keypoints": 400,
+            "rotation": worth,
+            "direction": worth * (1 + 0.01 * index),
+        }
+        for index, street in enumerate(streets)
+        for choice, worth in (("masks", 0.5), ("all but the boundaries", 1.0))
+        for split in ("fields", "points")
+    )
+    table = choices.table(runs, few_runs, worths).set_index(["streets", "choice"])
+    assert {streets for streets, _ in table.index} == {"all 8", "7, without 01"}
+    masks, inverse = (table.loc["all 8", name] for name in ("masks", "all but the boundaries"))
+    for title in ESTIMATORS.values():
+        failing = f"streets on which it fails, {title}"
+        assert masks[failing].startswith("1 ") and inverse[failing].startswith("0 ")
+    rule = "no worse (rule 5)"  # the errors are equal, so only the failures decide
+    assert (masks[rule], inverse[rule]) == ("", "yes")
+    assert masks["a keypoint tells"] == "less"
+    assert inverse["a keypoint tells"] == "as much"
+    assert masks["worth, rotation, by fields"].endswith("8 of 8 below 1")
