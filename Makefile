@@ -62,7 +62,7 @@ page: setup
 ifdef RUN
 code = $(shell find $(1) -name '*.py')
 LEARNING := $(call code,thesis_repro/data thesis_repro/segmentation street_world)
-PATHS := $(call code,thesis_repro/data thesis_repro/masks.py thesis_repro/mask_files.py thesis_repro/odometry opencv_exact)
+PATHS := $(call code,thesis_repro/data thesis_repro/masks thesis_repro/mask_files.py thesis_repro/odometry opencv_exact)
 DRAWING := $(filter-out %/page.py %/figures.py,$(call code,thesis_repro/study thesis_repro/report notebooks/thesis))
 NAMES := $(patsubst notebooks/%.ipynb,%,$(sort $(wildcard notebooks/*.ipynb)))
 NAMES := $(if $(or $(THESIS_REPRO_CITYSCAPES),$(if $(THESIS_REPRO_KITTI),,embedded)),$(NAMES),$(filter-out 01_% 02_% 04_%,$(NAMES)))

@@ -264,7 +264,9 @@ def describe_masks(source: LabelMasks | MaskFolder, sequence: kitti.Sequence) ->
     if isinstance(source, LabelMasks):
         shares = zip(cityscapes.LABELS, _class_shares(source), strict=False)
         held = [f"{label.name} {share:.0%}" for label, share in shares if share >= MIN_SHARE]
-        line += f" (width {source.dilation_width}); label maps hold {', '.join(held)}"
+        if source.dilation_width is not None:
+            line += f" (width {source.dilation_width})"
+        line += f"; label maps hold {', '.join(held)}"
     return line
 
 

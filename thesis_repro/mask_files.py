@@ -51,6 +51,10 @@ class LabelMasks:
         label_map = _read_once(path, self.settings.ids, status.st_mtime_ns, status.st_size)
         return keypoint_mask(label_map, self.size, self.dilation_width, self.settings)
 
+    def record(self) -> list[Any]:
+        """Return what the masks depend on beside files."""
+        return ["label maps", self.dilation_width, str(self.settings)]
+
     def check_files(self, known: set[Any]) -> None:
         """Raise InputError if a label map cannot be read. known: files that can, added to."""
         ids = self.settings.ids
@@ -121,6 +125,10 @@ class MaskFolder:
         if self.invert:
             return cv2.bitwise_not(mask)
         return mask
+
+    def record(self) -> list[Any]:
+        """Return what the masks depend on beside files."""
+        return ["masks", self.invert]
 
     def check_files(self, known: set[Any]) -> None:
         """Raise InputError if a mask cannot be read. known: files that can, added to."""

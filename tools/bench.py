@@ -33,7 +33,7 @@ from thesis_repro.running import messages
 from thesis_repro.running.files import write_text
 from thesis_repro.running.settings import ROOT
 from thesis_repro.segmentation import prediction
-from thesis_repro.study import methods
+from thesis_repro.study import controls, methods
 from thesis_repro.study.sources import Source
 
 FRAMES = 40  # from the sequence's start
@@ -123,7 +123,7 @@ def mask_cost(sequence, labels):
     """
     source, costs = Source(labels), np.zeros(2)
     kinds = [source.masks(sequence, width) for width in WIDTHS] + [
-        methods.METHODS[method].choose(sequence, source, methods.LINE_WIDTH)[1]
+        methods.METHODS[method].choose(sequence, source, controls.LINE_WIDTH)[1]
         for method in methods.MASK_CONTROLS
         if method != "true-labels"
     ]

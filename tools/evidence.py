@@ -16,6 +16,7 @@ import pandas as pd
 import choices
 import failures
 import label_quality
+import reasons
 from thesis import few_keypoints
 from thesis_repro import mask_files, masks
 from thesis_repro.data import kitti
@@ -89,6 +90,7 @@ def write(settings, folder, others=()):
         (worth.DECIDING, 0, 200, 100),
         settings.jobs,
     )
+    why = reasons.measure(sequences, [Source(labels)], jobs.CONTROL_WIDTH)
     streets = _streets(sequences)
     results.sweep(folder)
     for name in KEPT:
@@ -99,6 +101,7 @@ def write(settings, folder, others=()):
             "few_keypoints": few_keypoints.figure(few, times),
             "label_quality": label_quality.figure(qualities),
             "worth": report_worth.figure(worths),
+            "reasons": reasons.figure(why, worths),
         },
         {
             "failures": failures.table(steps),
@@ -107,6 +110,7 @@ def write(settings, folder, others=()):
             "few_keypoints": few_keypoints.summary(few, times),
             "worth": report_worth.table(worths),
             "choices": choices.table(runs, few_runs, worths),
+            "reasons": reasons.table(why, worths),
         },
         folder,
         note,

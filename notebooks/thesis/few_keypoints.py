@@ -214,8 +214,8 @@ def summary(rows: pd.DataFrame, times: pd.DataFrame | None = None) -> pd.DataFra
             line[f"failed, {ESTIMATORS[estimator]}"] = f"{failed} of {runs}"
         if times is not None:
             line["CPU time a frame (ms)"] = milliseconds.get((choice, number))
-        line["as good (rule 4)"] = _answer(rows, choice, number, "as_good")
-        line["no worse (rule 5)"] = _answer(rows, choice, number, "no_worse")
+        line["as good"] = _answer(rows, choice, number, "as_good")
+        line["no worse"] = _answer(rows, choice, number, "no_worse")
         lines.append(line)
     return pd.DataFrame(lines)
 

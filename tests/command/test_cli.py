@@ -14,8 +14,10 @@ import pytest
 import thesis_repro as tr
 from thesis_repro.command import cli
 from thesis_repro.command.options import build_parser
+from thesis_repro.command.options import named as named_options
 from thesis_repro.data import cityscapes
 from thesis_repro.data.trajectories import read_poses
+from thesis_repro.masks.kinds import KINDS, Kind
 from thesis_repro.running import results
 from thesis_repro.running.files import write_png
 
@@ -170,6 +172,22 @@ def test_label_maps_in_other_ids_give_the_same_masks(tiny_kitti, tmp_path):
         made.append((tmp_path / "masks/000002.png").read_bytes())
     assert made[0] == made[1] == made[2]
     assert "table" in results.record(tmp_path / "masks")
+
+
+def test_a_new_kind_of_mask_is_one_entry(monkeypatch, tiny_kitti, tmp_path):
+    def left(label_map, size, dilation_width, settings):
+        mask = np.zeros(size, np.uint8)
+        mask[:, : size[1] // 2] = 255
+        return mask
+
+    monkeypatch.setitem(KINDS, "left", Kind(left, "on the left", has_width=False))
+    assert "on the left" in named_options("study")["--keep"]["help"]
+    for index in range(4):
+        write_png(tmp_path / f"maps/{index:06d}.png", MAP)
+    where = ["--kitti", tiny_kitti, "--sequence", "00", "--labels", tmp_path / "maps"]
+    assert run("masks", *where, "--keep", "left", "--output", tmp_path / "masks") == 0
+    mask = cv2.imread(str(tmp_path / "masks/000002.png"), cv2.IMREAD_UNCHANGED)
+    assert mask[:, : mask.shape[1] // 2].all() and not mask[:, mask.shape[1] // 2 :].any()
 
 
 @pytest.mark.parametrize(

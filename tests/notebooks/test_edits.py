@@ -85,7 +85,8 @@ def test_an_edit_of_the_loop_shows_in_the_last_table_of_its_notebook(build, caps
     run("06", MASKS)
     thesis, yours = table("07", LOOP)
     assert thesis.equals(yours) and thesis["keypoints"] > 1000
-    assert "EDITED" not in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "EDITED" not in out and "masks: {'width': 10}" in out and "not the thesis's" not in out
     few = table("07", LOOP, ("MAX_KEYPOINTS = 2000", "MAX_KEYPOINTS = 500"))
     assert few[0].equals(thesis) and few[1]["keypoints"] <= 500 and few[1][TEXT] != thesis[TEXT]
     assert "EDITED" not in capsys.readouterr().out  # the package does the same with this knob
@@ -93,3 +94,14 @@ def test_an_edit_of_the_loop_shows_in_the_last_table_of_its_notebook(build, caps
     edited = table("07", LOOP, double)
     assert edited[0].equals(thesis) and edited[1][TEXT] > 10 * thesis[TEXT]
     assert "EDITED" in capsys.readouterr().out
+    run("06", MASKS, [("WIDTH = 10 ", "WIDTH = 3 ")])
+    run("07", LOOP[:5])
+    assert "masks: {'width': 3} (not the thesis's" in capsys.readouterr().out
+
+
+def test_answers_run_when_somebody_asks_for_them(build):
+    cells_of_answers = [*MASKS[:5], "50", "51"]
+    waiting = run("06", cells_of_answers)
+    assert waiting["runs"] == {} and not waiting["RUN_ANSWERS"]
+    ids = [*MASKS[:5], "45", "46", "50", "51"]
+    assert len(run("06", ids, [("RUN_ANSWERS = False", "RUN_ANSWERS = True")])["rows"]) == 5

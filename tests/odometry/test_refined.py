@@ -10,7 +10,7 @@ from street import Street
 
 from thesis_repro import odometry
 from thesis_repro.odometry import THESIS, Matches, metrics
-from thesis_repro.odometry.estimators import refined
+from thesis_repro.odometry.estimators import ESTIMATORS, refined
 from thesis_repro.odometry.refined import RefinedEstimator
 from thesis_repro.odometry.refined import fit as refine
 from thesis_repro.odometry.refined.motion_prior import (
@@ -185,12 +185,12 @@ def test_a_line_beside_the_road_costs_one_flagged_step(seed):
 
 def test_on_a_plain_drive_the_fit_has_no_flags_and_its_errors_are_smaller_and_vary_less():
     drive, errors = Street(5), {}
-    for estimator in ("thesis", "inliers", "refined"):
+    for name, entry in ESTIMATORS.items():
         results = [
-            odometry.run(drive, replace(THESIS, estimator=estimator, shuffle_seed=seed))
+            odometry.run(drive, replace(THESIS, estimator=entry.make, shuffle_seed=seed))
             for seed in range(3)
         ]
         assert all(result.flagged.empty for result in results)
-        errors[estimator] = [metrics.rmse(result.poses, drive.poses) for result in results]
+        errors[name] = [metrics.rmse(result.poses, drive.poses) for result in results]
     assert np.mean(errors["refined"]) < np.mean(errors["inliers"])
     assert np.std(errors["refined"]) < 0.5 * np.std(errors["inliers"])

@@ -147,6 +147,12 @@ def test_the_gallery_has_every_artefact_in_the_order_of_the_thesis(run):
     assert titles == [artefact["title"] for artefact in ARTEFACTS]
     links = re.findall(r"\]\(([^)]+)\)", gallery)
     assert len(links) > 30 and all((run.settings.figures / link).is_file() for link in links)
+    assert gallery.startswith(f"# Figures and tables, run {run.settings.run}\n")
+    assert "<details>" not in gallery
+    rows = pd.DataFrame({"number": range(24), "no worse": "yes"})
+    style.save_table(rows, run.settings.figures, "few_keypoints", "a note")
+    text = page.gallery(run.settings)
+    assert text.count("<details>") == text.count("</details>") == text.count("24 rows") == 1
 
 
 def test_links_are_relative_and_exist_and_no_folder_of_the_machine_is_named(run):
@@ -202,6 +208,7 @@ def test_the_page_in_git_is_made_from_what_is_in_git(run):
     shown = Reader((figures / "index.html").read_text())
     assert (figures / "index.html").read_text() == page.build(in_git)
     assert (figures / page.GALLERY).read_text() == page.gallery(in_git)
+    assert page.gallery(in_git).startswith("# Figures and tables\n")  # two runs: real and rendered
     links = shown.values("a", "href") + shown.values("img", "src")
     files = [link for link in links if not re.match("#|https:", link)]
     missing = [link for link in files if not (ROOT / "figures" / link.split("#")[0]).is_file()]

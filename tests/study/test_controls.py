@@ -13,7 +13,7 @@ from thesis_repro import mask_files, masks
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.odometry import THESIS, keypoints
 from thesis_repro.odometry.odometry import detect
-from thesis_repro.study import compare, methods, runner
+from thesis_repro.study import compare, controls, methods, runner
 from thesis_repro.study.jobs import first_jobs
 from thesis_repro.study.sources import Source
 
@@ -88,12 +88,12 @@ def test_random_lines_and_image_edges_cover_as_much_as_the_mask(sequence, made):
 def test_spread_keypoints_have_the_asked_number(sequence):
     counts = [len(detect(frame, THESIS)) for frame in sequence.frames()]
     target = np.mean(counts) / 2
-    distance = methods.min_distance(sequence, target)
+    distance = controls.min_distance(sequence, target)
     assert distance > THESIS.min_distance and distance == round(distance, 1)
     spread = replace(THESIS, min_distance=distance)
     left = np.mean([len(detect(frame, spread)) for frame in sequence.frames()])
     assert left == pytest.approx(target, rel=0.03)
-    assert methods.min_distance(sequence, max(counts)) == THESIS.min_distance
+    assert controls.min_distance(sequence, max(counts)) == THESIS.min_distance
 
 
 def test_controls_leave_as_many_keypoints_as_masks_of_the_tested_width(

@@ -75,7 +75,8 @@ def test_real_poses_of_other_kinds_are_told(kitti_real):
         (axes @ body, "turned"),
     ):
         assert metrics.TRUTH_KINDS[kind] in metrics.foreign_truth(estimated, poses)
-    assert metrics.foreign_truth(estimated, true) == ""
+    for poses in (true, body @ axes):  # as docs/own-masks.md says
+        assert metrics.foreign_truth(estimated, poses) == ""
 
 
 DETECT = """
@@ -139,3 +140,29 @@ def test_own_keypoints_are_drawn(street, capsys):
     failed = runs[runs["source"] != "own"]
     assert report._failed(planned, failed)["source"].tolist() == ["own"]
     assert report._failed(planned, runs).empty
+
+
+BREAKING = """
+from thesis_repro.odometry.odometry import detect as usual
+calls = []
+def detect(frame, settings, mask):
+    calls.append(frame)
+    if len(calls) > 5:
+        raise ValueError("broken:\\n" + 300 * "x ")
+    return usual(frame, settings, mask)
+"""
+
+
+def test_a_source_that_breaks_later_is_told_once_and_stays_in_the_summary(street, capsys):
+    path = street.parent / "own.py"
+    path.write_text(BREAKING)
+    masks = ["--masks", f"net={street.parent / 'masks'}", "--controls", "--sequences", "00"]
+    code, out = study(street, "--keypoints", f"own={path}", *masks, "--repetitions", 2)
+    lines = capsys.readouterr().err.splitlines()
+    (line,) = [line for line in lines if "broken" in line]
+    assert code == 1 and ",," not in line and "\\n" not in line
+    assert "failed: ValueError: broken: x x" in line
+    summary = pd.read_csv(out / "summary.csv").set_index("source")
+    assert summary.loc["own", "verdict"] == "all runs failed"
+    assert summary.loc["net", "verdict"] == "too few sequences to tell"
+    assert (out / "index.html").read_text().count("failed: ValueError") == 1

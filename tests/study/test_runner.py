@@ -14,6 +14,7 @@ from thesis_repro import mask_files, masks, odometry
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.odometry import metrics
+from thesis_repro.odometry.keypoints import filtered
 from thesis_repro.running import messages
 from thesis_repro.segmentation import training
 from thesis_repro.study import compare, methods, runner, workers
@@ -133,6 +134,33 @@ def test_a_sequence_without_structure_has_no_result(tiny_kitti, tmp_path):
     assert len(outcome.warnings) == 1 and "sequence 01, " in outcome.warnings[0]
     with pytest.raises(InputError, match="sequences/01: "):
         runner.run_jobs(jobs[2:], sequences, tmp_path / "none", tmp_path / "runs")
+
+
+def test_a_run_with_other_settings_is_made_again_and_no_other(small_world, small_labels, tmp_path):
+    jobs = [Job("00", "baseline"), Job("00", "masked", 5)]
+    arguments = jobs, opened(small_world, 4), small_labels, tmp_path
+    first = runner.run_jobs(*arguments)
+    changed = runner.run_jobs(*arguments, masked_settings={"detector": filtered})
+    again = runner.run_jobs(*arguments, masked_settings={"detector": filtered})
+    assert [(each.made, each.kept) for each in (first, changed, again)] == [(2, 0), (1, 1), (0, 2)]
+    keypoints = [each.table["mean_keypoints"].tolist() for each in (first, changed)]
+    assert keypoints[0][0] == keypoints[1][0] and keypoints[0][1] != keypoints[1][1]
+
+
+def test_masks_of_static_things_have_no_width_and_their_controls_are_what_they_are_called(
+    small_world, small_labels
+):
+    sequence = opened(small_world, 4)[0]
+    source = Source(small_labels, settings=masks.MaskSettings(keep="static"))
+    jobs = first_jobs([sequence], {"thesis": ()}, tested=5, sources=[source])
+    runs, failed = runner.chosen(jobs, {"00": sequence}, {"": source})
+    assert not failed and len(runs) == len(jobs)
+    made = {job.method: (job.dilation_width, run[2]) for job, run in runs.items()}
+    assert [made[name][0] for name in ("masked", "mirrored")] == [None, None]
+    width, exact = made["exact-boundaries"]
+    plain = mask_files.LabelMasks(small_labels, sequence, 5, masks.MaskSettings("exact"))
+    assert width == 5 and np.array_equal(exact[1], plain[1])
+    assert np.array_equal(made["masked"][1][1], made["static"][1][1])
 
 
 def test_first_jobs_are_complete_and_have_different_names(small_world, tiny_kitti):

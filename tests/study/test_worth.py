@@ -21,7 +21,7 @@ def tracks(points, depths, noise):
     rays = (points - CENTRE) / FOCAL
     moved = np.column_stack([rays, np.ones(len(rays))]) * depths[:, None] - FORWARD
     current = moved[:, :2] / moved[:, 2:] + noise / FOCAL
-    return worth._Tracks(points, rays, current, np.ones(len(points), bool), THESIS.threshold)
+    return worth.Tracks(points, rays, current, np.ones(len(points), bool), THESIS.threshold)
 
 
 def uniform(random, count):
@@ -59,7 +59,7 @@ def variances(make, scenes):
     for scene in range(scenes):
         simulated = make(np.random.default_rng(scene))
         count = len(simulated.points)
-        error = worth._angles(worth._motion(simulated, np.arange(count)), truth)
+        error = worth._angles(worth.refined_motion(simulated, np.arange(count)), truth)
         row = dict(zip(("rotation_true", "direction_true"), np.square(error) * count, strict=True))
         for split in worth.SPLIT:
             halves = worth._halves(simulated, count, split, (0, scene))

@@ -97,6 +97,7 @@ def test_evidence_keeps_what_shows_no_frame_and_compares_label_maps(
         "worth",
         "worth_runs",
         "choices",
+        "reasons",
         "few_keypoints_runs",
         *evidence.KEPT,
         *evidence.RUNS,

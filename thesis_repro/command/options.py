@@ -63,57 +63,9 @@ SEQUENCE = ("--kitti", "--sequence", "--camera", "--frames")
 DILATION = dict(type=int, metavar="W", help="dilation width, in pixels, of masks from label maps")
 
 
-# Options whose names stand in a table, which takes a second to import
-
-
-def _boundaries() -> dict[str, Any]:
-    from thesis_repro.masks import BOUNDARIES
-
-    return dict(
-        metavar="|".join(BOUNDARIES),
-        default="canny",
-        help="edges by Canny or all changes of class (canny)",
-    )
-
-
-def _keep() -> dict[str, Any]:
-    from thesis_repro.masks import KINDS
-
-    where = ", ".join(kind.help for kind in KINDS.values())
-    return dict(
-        metavar="|".join(KINDS), default="boundaries", help=f"keypoints {where} (boundaries)"
-    )
-
-
-def _estimator() -> dict[str, Any]:
-    from thesis_repro.odometry.estimators import ESTIMATORS
-
-    return dict(
-        choices=tuple(ESTIMATORS),
-        default="thesis",
-        help="motion by a vote of all matched points (PySLAM) or of RANSAC's inliers, or by least squares (thesis)",
-    )
-
-
-def _compared_estimators() -> dict[str, Any]:
-    from thesis_repro.study.jobs import ESTIMATORS
-
-    names = list(ESTIMATORS)
-    return dict(nargs="+", choices=names, default=names, help="one or several (all)")
-
-
-def _detector() -> dict[str, Any]:
-    from thesis_repro.odometry.estimators import DETECTORS
-
-    return dict(
-        choices=tuple(DETECTORS),
-        default="shi-tomasi",
-        help="keypoint detector; the tracker stays the same (shi-tomasi)",
-    )
-
-
-MASK_OPTIONS: dict[str, dict[str, Any] | Callable] = {
-    "--boundaries": _boundaries,
+NAMED: dict[str, Any] = {}  # see `named`
+MASK_OPTIONS: dict[str, dict[str, Any]] = {
+    "--boundaries": NAMED,
     "--symmetric": dict(
         action="store_true", help="centre masks on boundaries; the thesis's are half a pixel off"
     ),
@@ -131,7 +83,7 @@ MASK_OPTIONS: dict[str, dict[str, Any] | Callable] = {
         metavar="PIXELS",
         help="no keypoints on people and vehicles, nor within PIXELS of them (0)",
     ),
-    "--keep": _keep,
+    "--keep": NAMED,
     "--ids": dict(
         metavar="labels|train|colors|FILE",
         default="labels",
@@ -170,8 +122,8 @@ def _name_and_folder(text: str) -> tuple[str | None, Path]:
     return name, Path(folder).expanduser()  # a shell replaces "~" only at the start of a word
 
 
-# the arguments of `add_argument` for each option of each command, or a function that returns them
-COMMANDS: dict[str, dict[str, dict[str, Any] | Callable]] = {
+# the arguments of `add_argument` for each option of each command
+COMMANDS: dict[str, dict[str, dict[str, Any]]] = {
     "synthesize": {
         "out": dict(
             type=Path, metavar="OUT", help="new folder, or one in which this command was stopped"
@@ -230,7 +182,8 @@ COMMANDS: dict[str, dict[str, dict[str, Any] | Callable]] = {
         "--truth": dict(
             type=Path,
             metavar="FILE",
-            help="ground truth in KITTI's, TUM's or EuRoC's format (poses/NN.txt, or poses.txt beside the frames)",
+            help="true camera-to-world poses in KITTI's, TUM's or EuRoC's format (poses/NN.txt, or poses.txt "
+            "beside the frames)",
         ),
         "--calibration": dict(
             type=Path,
@@ -255,8 +208,8 @@ COMMANDS: dict[str, dict[str, dict[str, Any] | Callable]] = {
             help="a label map for each frame, or a folder of them for each sequence; needs --dilation",
         ),
         "--dilation": DILATION,
-        "--estimator": _estimator,
-        "--detector": _detector,
+        "--estimator": NAMED,
+        "--detector": NAMED,
         "--max-keypoints": dict(
             type=int,
             default=2000,
@@ -328,7 +281,7 @@ COMMANDS: dict[str, dict[str, dict[str, Any] | Callable]] = {
             metavar="N",
             help="shuffles of the matched points for each run (5)",
         ),
-        "--estimator": _compared_estimators,
+        "--estimator": NAMED,
         "--jobs": dict(
             type=settings.positive_whole_number,
             default=settings.cores(),
@@ -341,6 +294,38 @@ COMMANDS: dict[str, dict[str, dict[str, Any] | Callable]] = {
         ),
     },
 }
+
+
+def named(command: str) -> dict[str, dict[str, Any]]:
+    """Return the options whose names stand in tables, which take a second to import."""
+    from thesis_repro.masks import BOUNDARIES, KINDS
+    from thesis_repro.odometry.estimators import DETECTORS, ESTIMATORS
+
+    where = ", ".join(kind.help for kind in KINDS.values())
+    estimators: dict[str, Any] = dict(
+        choices=list(ESTIMATORS),
+        default="thesis",
+        help="motion by a vote of all matched points (PySLAM) or of RANSAC's inliers, or by least squares (thesis)",
+    )
+    if command == "study":
+        names = [name for name, entry in ESTIMATORS.items() if entry.is_compared]
+        estimators = dict(nargs="+", choices=names, default=names, help="one or several (all)")
+    return {
+        "--boundaries": dict(
+            metavar="|".join(BOUNDARIES),
+            default="canny",
+            help="edges by Canny or all changes of class (canny)",
+        ),
+        "--keep": dict(
+            metavar="|".join(KINDS), default="boundaries", help=f"keypoints {where} (boundaries)"
+        ),
+        "--estimator": estimators,
+        "--detector": dict(
+            choices=list(DETECTORS),
+            default="shi-tomasi",
+            help="keypoint detector; the tracker stays the same (shi-tomasi)",
+        ),
+    }
 
 
 def build_parser(
@@ -380,5 +365,5 @@ def build_parser(
             group: Any = sub
             if option in MASK_OPTIONS:
                 group = mask_options
-            group.add_argument(option, **(how if isinstance(how, dict) else how()))
+            group.add_argument(option, **(how or named(name)[option]))
     return parser

@@ -389,11 +389,14 @@ class Sequence:
         """
         if not self.distortion.any():
             return image
-        camera, size = self.intrinsics, image.shape[1::-1]
-        maps = cv2.initUndistortRectifyMap(
+        return cv2.remap(image, *self._maps, interpolation)
+
+    @cached_property
+    def _maps(self) -> tuple[np.ndarray, np.ndarray]:
+        camera, size = self.intrinsics, self.size[::-1]
+        return cv2.initUndistortRectifyMap(
             camera, self.distortion, None, camera, size, cv2.CV_16SC2
         )
-        return cv2.remap(image, *maps, interpolation)
 
     def frames(self) -> Iterator[np.ndarray]:
         """Yield the frames in order."""

@@ -32,8 +32,9 @@ def figure_comparison(table: pd.DataFrame) -> Figure:
 
     Grey dots are the sequences, the coloured mark is their typical ratio with its interval. The
     figure has one row of panels for each estimator and one column for each judging metric, all with
-    one scale, which shows nine of ten sequences. A sequence beyond it is named at the edge, and an
-    arrow marks an interval that is cut. With several sources of masks it shows no controls.
+    one scale, which shows nine of ten sequences, and three of four with masks. A sequence beyond it
+    is named at the edge, and an arrow marks an interval that is cut. With several sources of masks
+    it shows no controls.
     """
     rows = _shown(table)
     rows = rows[rows["metric"].isin(compare.JUDGING_METRICS)]
@@ -44,8 +45,14 @@ def figure_comparison(table: pd.DataFrame) -> Figure:
     figure, axes = style.new_figure(
         len(estimators), len(metrics), squeeze=False, sharex=True, sharey=True, height=height
     )
-    distances = rows[_sequences(table)].astype(float).map(np.log).abs().stack()
-    wide_enough = [reach for reach in REACHES if (distances < np.log(reach)).mean() >= 0.9]
+    distances = rows[_sequences(table)].astype(float).map(np.log).abs()
+    brought = distances[rows["method"].isin(BROUGHT)].stack()
+    wide_enough = [
+        reach
+        for reach in REACHES
+        if (distances.stack() < np.log(reach)).mean() >= 0.9
+        and (brought < np.log(reach)).mean() >= 0.75
+    ]
     reach = min(wide_enough, default=REACHES[-1])
     for panels, estimator in zip(axes, estimators, strict=True):
         panels[0].set_ylabel(ESTIMATORS[estimator])

@@ -22,7 +22,7 @@ from thesis_repro.odometry.runs import inside
 from thesis_repro.report import comparison, findings, page, paths, style, worth
 from thesis_repro.running import results
 from thesis_repro.running.files import write_text
-from thesis_repro.study import compare, methods, runner
+from thesis_repro.study import compare, controls, runner
 from thesis_repro.study.jobs import ESTIMATORS
 from thesis_repro.study.sources import KINDS, UNMASKED, FileMasks, Source, own_calls
 from thesis_repro.study.study import RUNS, Study
@@ -98,7 +98,7 @@ def write(
         embedded=embedded,
         kinds=KINDS,
         estimators=ESTIMATORS,
-        line_width=methods.LINE_WIDTH,
+        line_width=controls.LINE_WIDTH,
         changed=changed,
         widths=widths,
     )

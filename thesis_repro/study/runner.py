@@ -4,9 +4,11 @@ They run here or on a cluster. Each finished run is one CSV file with one row a 
 run again. Errors are computed from these files.
 """
 
+import inspect
 import json
 import textwrap
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -19,14 +21,16 @@ import pandas as pd
 from thesis_repro import odometry
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
+from thesis_repro.mask_files import LabelMasks, MaskFolder
 from thesis_repro.odometry import THESIS, OdometrySettings
 from thesis_repro.odometry.runs import is_flagged, poses_of
 from thesis_repro.running import messages, results
 from thesis_repro.running.files import listed, progress, write_text
 from thesis_repro.study import compare
+from thesis_repro.study.controls import OtherFrame, min_distance
 from thesis_repro.study.errors import path_errors
 from thesis_repro.study.jobs import ESTIMATORS, Job, in_passes, repeated
-from thesis_repro.study.methods import METHODS, min_distance, true_labels
+from thesis_repro.study.methods import METHODS, true_labels
 from thesis_repro.study.sources import UNMASKED, Source, by_name
 from thesis_repro.study.workers import open_pool
 
@@ -38,12 +42,12 @@ CODE = (
     "thesis_repro.mask_files",
     "thesis_repro.running.files",  # reads images
     "thesis_repro.data",
-    "thesis_repro.study.jobs",
-    "thesis_repro.study.methods",
+    "thesis_repro.study.controls",
     "thesis_repro.study.sources",
 )
+# without what reads poses, and with a table of names, whose entries a run records itself
+WITHOUT = ("thesis_repro.odometry.metrics", "thesis_repro.odometry.estimators")
 SETTINGS = "settings.json"  # of the runs in a folder
-READERS = ("thesis_repro.odometry.metrics",)  # read poses: a change of them repeats no run
 
 
 @dataclass(frozen=True)
@@ -286,10 +290,10 @@ def _stage(folder: Path, sequence: Sequence, made_from: Mapping[str, Mapping[str
 
 
 def _drop_changed(runs: Mapping[Job, Run], folder: Path) -> None:
-    """Delete the results of runs of a sequence that were made with other settings."""
+    """Delete the results of runs of a sequence that were made with other settings or masks."""
     now = {
-        job.name: settings.record()
-        for job, (_, settings, _) in runs.items()
+        job.name: {**settings.record(), "code": _code(settings.estimator), "masks": _record(masks)}
+        for job, (_, settings, masks) in runs.items()
         if job.sequence == folder.name
     }
     now = json.loads(json.dumps(now, default=float))  # numbers of numpy
@@ -302,9 +306,20 @@ def _drop_changed(runs: Mapping[Job, Run], folder: Path) -> None:
         write_text(path, json.dumps(before | now, indent=1))
 
 
+def _record(masks: Any) -> Any:
+    return masks.record() if isinstance(masks, LabelMasks | MaskFolder | OtherFrame) else None
+
+
+def _code(estimator: Any) -> str:
+    """Return the code of an estimator, which a person may have added to the table of names."""
+    with suppress(OSError, TypeError):  # the thesis's, which is None, or of a console
+        return inspect.getsource(estimator)
+    return ""
+
+
 def _versions() -> dict[str, Any]:
     return {
-        "code": results.digest_of_code(*CODE, without=READERS),
+        "code": results.digest_of_code(*CODE, without=WITHOUT),
         **results.made_with("opencv", "numpy", "numba"),
     }
 

@@ -67,7 +67,8 @@ class Source:
         """
         if not self.has_label_maps:
             return MaskFolder(self.folder, sequence, self.invert)
-        return LabelMasks(self.folder, sequence, dilation_width, self.settings)
+        width = dilation_width if self.has_width else None
+        return LabelMasks(self.folder, sequence, width, self.settings)
 
     def check_file(self, path: Path, size: tuple[int, int]) -> None:
         """Raise InputError if a file is not a label map, or not a mask of size (height, width)."""

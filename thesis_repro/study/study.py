@@ -108,10 +108,16 @@ class Study:
                     self.tested,
                     self.estimators,
                 )
-                both = run_jobs(first_jobs + more_jobs)
-                # the second call counts the runs of the first one as kept
-                made, kept = both.made + first.made, both.kept - first.made
-                outcome = replace(both, made=made, kept=kept)
+                done = set(zip(first.table["sequence"], first.table["run"], strict=True))
+                done_jobs = [job for job in first_jobs if (job.sequence, job.name) in done]
+                both = run_jobs(done_jobs + more_jobs)
+                outcome = replace(
+                    both,
+                    made=both.made + first.made,
+                    kept=both.kept - first.made,  # the runs of the first call count as kept
+                    failed_jobs=both.failed_jobs + first.failed_jobs,
+                    warnings=first.warnings + both.warnings,
+                )
         table = outcome.table[~outcome.table["sequence"].isin(foreign)]
         return replace(outcome, table=table, warnings=[*outcome.warnings, *foreign.values()])
 

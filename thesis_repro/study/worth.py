@@ -100,7 +100,7 @@ _RANDOM = ("", 0)  # the choice of all keypoints, from which the random ones are
 Choices = Mapping[tuple[str, int], tuple[OdometrySettings, Masks | None]]
 
 
-class _Tracks(NamedTuple):
+class Tracks(NamedTuple):
     """N keypoints of a frame, tracked into the next one."""
 
     points: np.ndarray  # (N, 2), pixels
@@ -142,7 +142,7 @@ def worth(
     shared = SharedCalls()
     rows: list[dict] = []
     for index in steps if description is None else progress(steps, description):
-        random, chosen = _tracked(sequence, int(index), choices, shared, calls)
+        random, chosen = tracked(sequence, int(index), choices, shared, calls)
         references: dict[tuple, dict] = {}  # of random keypoints
         for (name, number), tracks in chosen.items():
             count = min(number or len(tracks.points), len(tracks.points))
@@ -165,13 +165,13 @@ def worth(
     return table
 
 
-def _tracked(
+def tracked(
     sequence: Sequence,
     index: int,
     choices: Choices,
     shared: SharedCalls,
     calls: Mapping[str, Calls],
-) -> tuple[_Tracks, dict[tuple[str, int], _Tracks]]:
+) -> tuple[Tracks, dict[tuple[str, int], Tracks]]:
     """Return all keypoints of frame `index`, and those of each choice, tracked into the next."""
     frame, following = sequence.frame(index), sequence.frame(index + 1)
     made = {id(masks): masks[index] for _, masks in choices.values() if masks is not None}
@@ -196,7 +196,7 @@ def _tracked(
         for key, points in group.items():
             places = inverse.ravel()[first : first + len(points)]
             first += len(points)
-            tracks[key] = _Tracks(
+            tracks[key] = Tracks(
                 points,
                 normalise(points, sequence.intrinsics),
                 normalise(moved[places], sequence.intrinsics),
@@ -206,7 +206,7 @@ def _tracked(
     return tracks.pop(_RANDOM), tracks
 
 
-def _halves(tracks: _Tracks, count: int, split: str, seed: tuple[int, ...]) -> dict[str, float]:
+def _halves(tracks: Tracks, count: int, split: str, seed: tuple[int, ...]) -> dict[str, float]:
     """Draw keypoints, divide them, and return how far the motions of both halves are apart.
 
     {keypoints; rotation_deg, direction_deg: angles; rotation_variance, direction_variance: of one
@@ -216,7 +216,7 @@ def _halves(tracks: _Tracks, count: int, split: str, seed: tuple[int, ...]) -> d
     drawn = random.permutation(len(tracks.points))[:count]
     in_first = SPLIT[split](tracks.points[drawn], random)
     first, second = drawn[in_first], drawn[~in_first]
-    angles = _angles(_motion(tracks, first), _motion(tracks, second))
+    angles = _angles(refined_motion(tracks, first), refined_motion(tracks, second))
     weight = max(len(first) * len(second), 1) / max(len(drawn), 1)
     numbers: dict[str, float] = {"keypoints": len(drawn)}
     for motion, angle in zip(MOTIONS, angles, strict=True):
@@ -239,7 +239,7 @@ def _by_points(points: np.ndarray, random: np.random.Generator) -> np.ndarray:
 SPLIT: dict[str, Callable] = {"fields": _by_fields, "points": _by_points}
 
 
-def _motion(tracks: _Tracks, indices: np.ndarray) -> Motion | None:
+def refined_motion(tracks: Tracks, indices: np.ndarray) -> Motion | None:
     """Return the refined motion of some keypoints; None if they give none."""
     indices = indices[tracks.found[indices]]
     if len(indices) < MIN_MATCHES:
