@@ -30,7 +30,7 @@ from thesis_repro.study.sources import Source
 sys.path.append(str(ROOT / "notebooks"))
 
 # isort: split
-from thesis import domain_gap, thesis_tables
+from thesis import domain_gap, section_4_2
 from thesis.trainings import TABLE
 
 SEEDS = range(10)  # the first one is the default run's
@@ -153,8 +153,8 @@ def rows(runs, comparison, source, facts):
             row["controls_beaten"] = (verdicts == compare.LOWER).sum()
         else:
             masked, baseline = (compare.of_method(own, name) for name in ("masked", "baseline"))
-            best = thesis_tables.of_chosen_width(masked)
-            changes = thesis_tables.changes(best, baseline, "rmse")
+            best = section_4_2.of_chosen_width(masked)
+            changes = section_4_2.changes(best, baseline, "rmse")
             row["table_4_2_mean"] = changes.mean()
             row["table_4_2_improved"] = (changes < 0).sum()
         yield row

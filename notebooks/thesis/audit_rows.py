@@ -11,7 +11,7 @@ from typing import Any
 import pandas as pd
 from scipy.stats import binomtest
 
-from thesis import thesis_tables
+from thesis import section_4_2
 from thesis.audit import METRICS, geometric_mean, measurement, ratio, share
 from thesis.captions import REPORTED
 from thesis_repro.data.cityscapes import LABELS
@@ -174,11 +174,11 @@ def _sign_test(metric: str, widths: float) -> float:
 def of_study(runs: pd.DataFrame, shuffled: pd.DataFrame) -> list[dict[str, Any]]:
     """Return the rows that follow from the runs of notebook 08.
 
-    shuffled: its repetitions of all keypoints, see `thesis_tables.null_distribution`.
+    shuffled: its repetitions of all keypoints, see `section_4_2.null_distribution`.
     """
     run = partial(of_method, runs)
     every, masks = run("baseline"), run("masked", [compare.tested_width(runs)])
-    best = thesis_tables.of_chosen_width(compare.of_method(runs, "masked"))
+    best = section_4_2.of_chosen_width(compare.of_method(runs, "masked"))
     nine_to_11, other_widths = run("masked", WIDTHS), run("masked", [*range(1, 9), *range(12, 16)])
     static, static_boundaries = run("static"), run("static-boundaries")
     few, corrected, true_maps = run("fewer"), run("corrected"), run("true-labels")
@@ -217,12 +217,12 @@ def _of_best_widths(
 ) -> list[dict[str, Any]]:
     """Return rows 2, 31, 35, 39 and 41. best: the runs with masks of each sequence's best width."""
     masked, every = compare.of_method(runs, "masked"), compare.of_method(runs, "baseline")
-    stability = thesis_tables.stability(masked, every)
+    stability = section_4_2.stability(masked, every)
     by_width = masked.groupby(["sequence", "dilation_width"])[["rmse", "mae"]].mean()
     by_rmse = by_width["rmse"].groupby("sequence").idxmin()
     by_mae = by_width["mae"].groupby("sequence").idxmin()
     rmse_ratios = by_width["rmse"][by_mae].to_numpy() / by_width["rmse"][by_rmse].to_numpy()
-    widths = thesis_tables.best_widths(masked)["dilation_width"]
+    widths = section_4_2.best_widths(masked)["dilation_width"]
     best_of = "masks of the best width over all keypoints"
     by_other = "sequences with another best width by MAE"
     by_both = "width chosen by MAE over width chosen by RMSE"
@@ -241,11 +241,11 @@ def _of_best_widths(
 
 def _of_null_distribution(shuffled: pd.DataFrame, widths: int) -> list[dict[str, Any]]:
     """Return row 39."""
-    studies = thesis_tables.null_distribution(shuffled, widths, "rmse")
+    studies = section_4_2.null_distribution(shuffled, widths, "rmse")
     measurements = []
     for name in ("mean", "median"):
         values = studies.agg(name, axis=1)
-        low, high = thesis_tables.middle(values)
+        low, high = section_4_2.middle(values)
         quantity = f"{name} change that the procedure reports if masks do nothing"
         row = measurement("39", quantity, values.mean(), "%", metric="RMSE")
         measurements.append({**row, "low": low, "high": high, "n": len(studies)})
@@ -256,7 +256,7 @@ def _of_null_distribution(shuffled: pd.DataFrame, widths: int) -> list[dict[str,
 
 def _of_alike_widths(masked: pd.DataFrame, shuffled: pd.DataFrame) -> list[dict[str, Any]]:
     """Return row 41: how many widths count as independent, and what this does to its test."""
-    correlation, widths = thesis_tables.independent_widths(masked, shuffled, "rmse")
+    correlation, widths = section_4_2.independent_widths(masked, shuffled, "rmse")
     chance = 100 * _sign_test("RMSE", widths)
     alike = "correlation of the errors of two widths, about the mean of all keypoints"
     so_few = (

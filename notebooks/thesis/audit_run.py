@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 from cv2 import INTER_NEAREST, resize
 
-from thesis import ablations, artefacts, audit_rows, domain_gap, thesis_tables, timing
+from thesis import ablations, artefacts, audit_rows, domain_gap, section_4_2, timing
 from thesis.audit import measurement
 from thesis_repro.data import cityscapes
 from thesis_repro.data.cityscapes import ID, read_label_map
@@ -153,7 +153,7 @@ def of_times(folder: Path) -> list[dict[str, Any]]:
     """Return rows 16, 47 and 49, from the times that notebook 08 used."""
     seconds = pd.read_csv(folder / "seconds.csv", dtype={"sequence": str})
     savings = pd.DataFrame(
-        {name: thesis_tables.time_savings(rows) for name, rows in seconds.groupby("sequence")}
+        {name: section_4_2.time_savings(rows) for name, rows in seconds.groupby("sequence")}
     )
     saved = savings[savings.index.isin(audit_rows.WIDTHS)].mean()
     stages = pd.read_csv(folder / "budget.csv")

@@ -20,7 +20,7 @@ from urllib.parse import quote
 
 from markupsafe import Markup
 
-from thesis import captions, tables, thesis_tables
+from thesis import captions, section_4_2, tables
 from thesis_repro.report import page, texts
 from thesis_repro.running import messages, results
 from thesis_repro.running.files import atomic, listed, write_text
@@ -269,7 +269,7 @@ def beside_the_thesis(settings: Settings) -> dict[str, Any]:
         numbers["figure_4_07"] = {"keypoints": chosen["mean keypoints"].clip(lower=1)}
     seconds = tables.read(settings.figures / "timings" / "seconds.csv")
     if len(seconds):
-        numbers["figure_4_17"] = {"saved": 0 - thesis_tables.time_savings(seconds)}
+        numbers["figure_4_17"] = {"saved": 0 - section_4_2.time_savings(seconds)}
     return numbers
 
 

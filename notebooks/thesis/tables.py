@@ -1,7 +1,7 @@
 """Tables 4.1 to 4.3 and the time of a frame, with units and few digits.
 
 Runs are rows of the table of `runner.run_jobs`. Equation 4.1 and the choice of a width are in
-`thesis_tables`.
+`section_4_2`.
 """
 
 from pathlib import Path
@@ -9,7 +9,7 @@ from typing import Any
 
 import pandas as pd
 
-from thesis import thesis_tables
+from thesis import section_4_2
 from thesis.captions import REPORTED
 from thesis_repro.study import compare
 
@@ -40,14 +40,14 @@ def table_4_1(masked: pd.DataFrame, reported_as: str) -> pd.DataFrame:
     masked: the runs with masks of each width. The last columns have the thesis's numbers;
     reported_as: how to name them.
     """
-    best = thesis_tables.best_widths(masked)
+    best = section_4_2.best_widths(masked)
     reported = pd.DataFrame(REPORTED["table_4_1"]).set_index("sequence")
     reported = reported.reindex(best.index).astype("Int64")
     table = pd.DataFrame(index=best.index)
     table["frames"] = best["frames"]
     table["dilation width (pixels)"] = best["dilation_width"]
     table["mean keypoints"] = best["mean_keypoints"].round().astype(int)
-    table["failed runs"] = _failed_of(thesis_tables.of_chosen_width(masked))
+    table["failed runs"] = _failed_of(section_4_2.of_chosen_width(masked))
     table[f"width, {reported_as}"] = reported["dilation_width"]
     table[f"mean keypoints, {reported_as}"] = reported["mean_keypoints"]
     return table.reset_index()
@@ -74,15 +74,15 @@ def table_of_change(
     or "mae") is in metres, Equation 4.1 in percent. The column "one run each" has the thesis's
     literal procedure: one run of all keypoints and of each width (repetition 0), also to choose the
     width. Beside it stands what this procedure gives if masks do nothing
-    (`thesis_tables.null_distribution`), simulated from `shuffled`: runs with all keypoints, many
+    (`section_4_2.null_distribution`), simulated from `shuffled`: runs with all keypoints, many
     repetitions.
     The last rows have the sum of the percentages (the thesis's "aggregate"), their mean with
     Student's t interval, and their median.
     """
-    best = thesis_tables.of_chosen_width(masked)
-    change = thesis_tables.changes(best, baseline, metric)
-    single = thesis_tables.changes_of_repetition(masked, baseline, metric)
-    studies = thesis_tables.null_distribution(shuffled, masked["dilation_width"].nunique(), metric)
+    best = section_4_2.of_chosen_width(masked)
+    change = section_4_2.changes(best, baseline, metric)
+    single = section_4_2.changes_of_repetition(masked, baseline, metric)
+    studies = section_4_2.null_distribution(shuffled, masked["dilation_width"].nunique(), metric)
     reported = pd.Series(REPORTED[REPORTED_CHANGES[metric]])
     columns = {"change (%)": (change, _summary(change))}
     columns[SINGLE] = single, _summary(single)
@@ -126,7 +126,7 @@ def _summary(changes: pd.Series) -> dict[str, float]:
 def _summary_of_studies(studies: pd.DataFrame) -> dict[str, float]:
     """Return the last rows for simulated studies (%), one row a study: means over the studies."""
     means = studies.mean(axis=1)
-    low, high = thesis_tables.middle(means)
+    low, high = section_4_2.middle(means)
     middle = f"mean, middle {compare.LEVEL} % of {len(studies)} simulated studies"
     return {
         "sum (the thesis's aggregate)": studies.sum(axis=1).mean(),
@@ -145,23 +145,23 @@ def procedure(runs: pd.DataFrame, shuffled: pd.DataFrame) -> list[dict[str, Any]
 
     Changes are in percent: mean, median, improved and failed (sequences) of repetition 0; lowest
     and highest mean of a repetition; null_mean, null_low, null_high and null_improved if masks did
-    nothing (`thesis_tables.null_distribution`).
+    nothing (`section_4_2.null_distribution`).
     """
     masked, baseline = compare.of_method(runs, "masked"), compare.of_method(runs, "baseline")
     widths = masked["dilation_width"].nunique()
     # the embedded world repeats only one width, and one width is no choice
     widths_run = masked.groupby("repetition")["dilation_width"].nunique()
     repetitions = sorted(widths_run.index[widths_run == widths])
-    best = thesis_tables.of_chosen_width(masked[masked["repetition"] == 0])
+    best = section_4_2.of_chosen_width(masked[masked["repetition"] == 0])
     rows = []
     for metric in ("rmse", "mae"):
         by_repetition = [
-            thesis_tables.changes_of_repetition(masked, baseline, metric, repetition)
+            section_4_2.changes_of_repetition(masked, baseline, metric, repetition)
             for repetition in repetitions
         ]
         means = [changes.mean() for changes in by_repetition]
-        studies = thesis_tables.null_distribution(shuffled, widths, metric)
-        null_low, null_high = thesis_tables.middle(studies.mean(axis=1))
+        studies = section_4_2.null_distribution(shuffled, widths, metric)
+        null_low, null_high = section_4_2.middle(studies.mean(axis=1))
         row = {
             "name": compare.METRICS[metric],
             "widths": widths,

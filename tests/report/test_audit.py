@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from thesis import ablations, audit, audit_rows, audit_run, domain_gap, thesis_tables, trainings
+from thesis import ablations, audit, audit_rows, audit_run, domain_gap, section_4_2, trainings
 from thesis_repro.data.cityscapes import ID
 from thesis_repro.report import style
 from thesis_repro.running import results
@@ -70,7 +70,7 @@ def test_alike_widths_count_as_one_and_unlike_ones_as_all():
         (of_sequence + random.normal(size=len(keys)), widths / (1 + (widths - 1) / 2)),
     ):
         masked = pd.DataFrame({"rmse": np.exp(2 + errors)}, keys).reset_index()
-        _, number = thesis_tables.independent_widths(masked, level, "rmse")
+        _, number = section_4_2.independent_widths(masked, level, "rmse")
         assert number == pytest.approx(expected, rel=0.15)
 
 

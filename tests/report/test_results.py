@@ -12,7 +12,7 @@ from cells import cells
 from drawn import problems
 from matplotlib.container import BarContainer
 
-from thesis import chapter4, few_keypoints, frames, tables, thesis_tables
+from thesis import chapter4, few_keypoints, frames, section_4_2, tables
 from thesis.captions import REPORTED
 from thesis_repro.errors import one_line
 from thesis_repro.report import comparison, findings, style, texts
@@ -29,7 +29,7 @@ NEVER_SHUFFLED = made_up.runs(
 
 
 def best_of(runs):
-    return thesis_tables.of_chosen_width(compare.of_method(runs, "masked"))
+    return section_4_2.of_chosen_width(compare.of_method(runs, "masked"))
 
 
 def runs_of(names, errors, widths=(5, 10, 15), **options):
@@ -104,7 +104,7 @@ def test_masks_that_do_nothing_are_told_beside_the_literal_procedure():
     table = tables.table_of_change(*widths_of(runs), shuffled, "rmse", "thesis").set_index(
         "sequence"
     )
-    studies = thesis_tables.null_distribution(shuffled, 3, "rmse")
+    studies = section_4_2.null_distribution(shuffled, 3, "rmse")
     null = table["change (%), one run each, if masks did nothing"]
     assert null["mean"] == pytest.approx(studies.mean(axis=1).mean(), abs=0.006)
     assert null["mean"] < -5 and null["sequences improved"] > 6  # the best of three widths
@@ -261,7 +261,7 @@ def drawn_by_cells(runs):
     save = SimpleNamespace(save_figure=lambda figure, name, note: figures.update({name: figure}))
     given = {"runs": runs, "SEQUENCES": sorted(runs["sequence"].unique()), "note": ""}
     modules = {"np": np, "chapter4": chapter4, "frames": frames, "style": style}
-    modules["thesis_tables"] = thesis_tables
+    modules["section_4_2"] = section_4_2
     names = given | modules | {"artefacts": save}
     for number in ("58", "54", "18", "55", "56", "26", "27"):
         exec(cells("08_results.ipynb", "code")[f"08-{number}"], names)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from thesis import ablations, thesis_tables
+from thesis import ablations, section_4_2
 from thesis_repro import mask_files, masks
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.odometry import THESIS, keypoints
@@ -105,7 +105,7 @@ def test_controls_leave_as_many_keypoints_as_masks_of_the_tested_width(
     runs = runner.run_jobs(jobs, opened, small_labels, tmp_path).table
     left = compare.keypoints_left(runs)
     masked = compare.of_method(runs, "masked")
-    jobs += thesis_tables.reduced_jobs(thesis_tables.best_widths(masked))
+    jobs += section_4_2.reduced_jobs(section_4_2.best_widths(masked))
     jobs += runner.keypoint_controls(runs, opened, [Source(small_labels)], 1, 5)
     assert len({job.name for job in jobs}) == len(jobs)
     runs = runner.run_jobs(jobs, opened, small_labels, tmp_path).table.set_index("run")

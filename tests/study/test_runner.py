@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from thesis import thesis_tables, timing
+from thesis import section_4_2, timing
 from thesis_repro import mask_files, masks, odometry
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
@@ -34,9 +34,7 @@ def finished(small_world, small_labels, tmp_path_factory):
     jobs = first_jobs(opened(small_world), {"thesis": WIDTHS})
     inputs = {"sequences": opened(small_world), "sources": small_labels, "folder": folder}
     summary = runner.run_jobs(jobs, **inputs, processes=2).table
-    jobs += thesis_tables.reduced_jobs(
-        thesis_tables.best_widths(compare.of_method(summary, "masked"))
-    )
+    jobs += section_4_2.reduced_jobs(section_4_2.best_widths(compare.of_method(summary, "masked")))
     return folder, jobs, runner.run_jobs(jobs, **inputs, processes=2).table
 
 
@@ -51,7 +49,7 @@ def test_a_run_equals_the_odometry_of_its_sequence(small_world, small_labels, fi
     )
     assert {name: row[name] for name in expected} == pytest.approx(expected, nan_ok=True, rel=0)
     assert row["se3"] <= row["rmse"]
-    best = thesis_tables.best_widths(compare.of_method(summary, "masked")).loc["01"]
+    best = section_4_2.best_widths(compare.of_method(summary, "masked")).loc["01"]
     least = summary[summary["sequence"] == "01"].groupby("method")[["rmse", "max_keypoints"]].min()
     assert best["rmse"] == least.loc["masked", "rmse"]
     assert least.loc["reduced", "max_keypoints"] == round(best["mean_keypoints"])
