@@ -4,6 +4,8 @@ The rule is in study/worth.py (9). Errors are those of runs that exist: of masks
 (width 10), and of the curve of few keypoints.
 """
 
+from itertools import product
+
 import numpy as np
 import pandas as pd
 
@@ -31,13 +33,12 @@ def table(runs: pd.DataFrame, few_runs: pd.DataFrame, worths: pd.DataFrame) -> p
     """Return one row a choice and number of keypoints, with all streets and without LEFT_OUT.
 
     runs: of a study. few_runs: of `few_keypoints.measure`. worths: of `worth.measure`. Masks and
-    controls have all their keypoints in the runs, and DECIDING of them have the worth.
+    controls have all their keypoints in the runs, and DECIDING of them have the worth. Where it was
+    not measured, its cells are empty.
     """
     parts = []
-    for streets in (
-        sorted(worths["sequence"].unique()),
-        sorted({*worths["sequence"]} - {LEFT_OUT}),
-    ):
+    everywhere = sorted(runs["sequence"].unique())
+    for streets in (everywhere, [name for name in everywhere if name != LEFT_OUT]):
         tables = (each[each["sequence"].isin(streets)] for each in (runs, few_runs, worths))
         part = _of_streets(*tables)
         part.insert(0, "streets", f"all {len(streets)}")
@@ -55,7 +56,9 @@ def _of_streets(runs: pd.DataFrame, few_runs: pd.DataFrame, worths: pd.DataFrame
     of_choices += [
         (choice, number, (name, number)) for number in NUMBERS[::-1] for choice, name in FEW.items()
     ]
-    typical_worths = typical(worths).set_index(["choice", "number"])
+    typical_worths = {
+        (row["choice"], row["number"]): row for row in typical(worths).to_dict("records")
+    }
     rows = []
     for choice, number, name in of_choices:
         if isinstance(name, tuple):
@@ -64,14 +67,14 @@ def _of_streets(runs: pd.DataFrame, few_runs: pd.DataFrame, worths: pd.DataFrame
             chosen = runs[(runs["method"] == name) & (runs["dilation_width"] == CONTROL_WIDTH)]
             chosen = chosen.assign(keypoints=chosen["mean_keypoints"])
             reference = runs[runs["method"] == "baseline"]
-        if (choice, number) not in typical_worths.index or chosen.empty:
+        if chosen.empty:
             continue
         row = {"choice": choice, "keypoints": f"{chosen['keypoints'].mean():.0f}"}
-        worth = typical_worths.loc[(choice, number)].to_dict()
-        row["a keypoint tells"] = worth["verdict"]
-        for split in SPLIT:
-            for motion in ("direction", "rotation"):
-                row[f"worth, {motion}, by {split}"] = cell(worth, f"{motion}_{split}")
+        worth = typical_worths.get((choice, number))
+        row["a keypoint tells"] = worth["verdict"] if worth else ""
+        for split, motion in product(SPLIT, ("direction", "rotation")):
+            text = cell(worth, f"{motion}_{split}") if worth else ""
+            row[f"worth, {motion}, by {split}"] = text
         rows.append(row | _errors(chosen, reference))
     return pd.DataFrame(rows)
 
