@@ -136,11 +136,11 @@ class Study:
                 if name == sequence.name
             ]
             if reasons and all(reasons):  # with every estimator
-                lines[sequence.name] = (
-                    f"{sequence.poses_path}: {reasons[0]}; sequence {sequence.name} is left out"
-                )
+                lines[sequence.name] = f"{sequence.poses_path}: {reasons[0]}"
         if set(runs["sequence"]) == set(lines):
-            raise InputError(next(iter(lines.values())))
+            line = next(iter(lines.values()))
+            raise InputError(f"{line}; no sequence with other poses is left to compare")
+        lines = {name: f"{line}; sequence {name} is left out" for name, line in lines.items()}
         for line in lines.values():
             messages.log.warning(line)
         return lines
