@@ -7,11 +7,18 @@ import pandas as pd
 from scipy.spatial.transform import Rotation
 
 from thesis_repro.study import compare
-from thesis_repro.study.jobs import ESTIMATORS, Job
+from thesis_repro.study.jobs import Job
 
 
 def runs(
-    names, errors, widths, *, sources=("",), estimators=tuple(ESTIMATORS), repetitions=3, noise=0.0
+    names,
+    errors,
+    widths,
+    *,
+    sources=("",),
+    estimators=("thesis", "refined"),
+    repetitions=3,
+    noise=0.0,
 ):
     """Runs in which every metric is errors(sequence, method, width), and the MAE half of it.
 
