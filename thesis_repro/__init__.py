@@ -58,24 +58,26 @@ __all__ = [
 ]
 
 
-def __getattr__(name: str) -> Any:
-    if name == "__version__":
-        return metadata.version("thesis-repro")
-    if name not in __all__:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    try:
-        if name == "build_unet":
-            from thesis_repro.segmentation.unet import build_unet
+if not TYPE_CHECKING:  # a type checker sees the names above, and no others
 
-            return build_unet
-        from thesis_repro import _face
-    except ImportError as error:
-        missing = missing_package(error)
-        if missing is None:
-            raise
-        # not an ImportError, so that help() and hasattr() work without TensorFlow
-        raise AttributeError(f"{name}: {missing}") from None
-    return getattr(_face, name)
+    def __getattr__(name: str) -> Any:
+        if name == "__version__":
+            return metadata.version("thesis-repro")
+        if name not in __all__:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        try:
+            if name == "build_unet":
+                from thesis_repro.segmentation.unet import build_unet
+
+                return build_unet
+            from thesis_repro import _face
+        except ImportError as error:
+            missing = missing_package(error)
+            if missing is None:
+                raise
+            # not an ImportError, so that help() and hasattr() work without TensorFlow
+            raise AttributeError(f"{name}: {missing}") from None
+        return getattr(_face, name)
 
 
 def __dir__() -> list[str]:

@@ -91,6 +91,8 @@ def test_evidence_keeps_what_shows_no_frame_and_compares_label_maps(
     (tmp_path / "exact/01").symlink_to(small_labels / "01")  # a further source for one sequence
     others = [Source(tmp_path / "exact", name="exact")]
     out = tmp_path / "out"
+    monkeypatch.setattr(evidence.worth, "MAX_STEPS", 1)
+    monkeypatch.setattr(evidence.few_keypoints, "TIMED_RUNS", 1)
     evidence.write(settings, out, others)
     names = {"README", "failures", "label_quality", "streets", "few_keypoints"}
     names |= {

@@ -202,7 +202,13 @@ def study(options: Any) -> int:
             checks.of_run(run.sequence, run.frames, run.flagged) for run in runs.itertuples()
         ]
         warnings += outcome.warnings + _warn(chain(*of_runs))
-        worths = planned.worths(folder, *workers)
+        worths = None
+        with_runs = set(outcome.table["source"])
+        measured = [source for source in planned.sources if source.name in with_runs]
+        try:
+            worths = replace(planned, sources=tuple(measured)).worths(folder, *workers)
+        except InputError as error:  # the runs are there, so their page is written
+            warnings += _warn([f"no worth of keypoints: {error}"])
         page = study.write(planned, outcome.table, folder, warnings, worths)
     made = f"{len(outcome.table):,} runs, {outcome.failed_jobs:,} failed"
     messages.summary(f"{made}; open {page} in a browser", outcome.kept)

@@ -7,12 +7,12 @@ with a number are small objects, equal if their numbers are.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
 
 from thesis_repro.errors import InputError
-from thesis_repro.odometry import corners
 from thesis_repro.odometry.settings import THESIS, OdometrySettings
 
 FIELDS = (5, 16)  # rows and columns into which a frame is divided to fill a mask
@@ -46,6 +46,7 @@ class spread:  # it is called like a function
         mask: np.ndarray | None = None,
     ) -> np.ndarray:
         """Find the keypoints of a frame."""
+        corners = _corners()
         frame = _unchanging(frame)
         near, far = settings.min_distance, max(frame.shape)
         settings = replace(settings, max_keypoints=self.number)
@@ -82,6 +83,7 @@ class filled:
         mask: np.ndarray | None = None,
     ) -> np.ndarray:
         """Find the keypoints of a frame."""
+        corners = _corners()
         frame = _unchanging(frame)
         points = (self.detector or corners.detect)(frame, settings, mask)
         if mask is None:
@@ -106,11 +108,17 @@ def filtered(
     frame: np.ndarray, settings: OdometrySettings = THESIS, mask: np.ndarray | None = None
 ) -> np.ndarray:
     """Find the thesis's keypoints in the whole frame, and drop those outside the mask."""
-    points = corners.detect(frame, settings)
+    points = _corners().detect(frame, settings)
     if mask is None:
         return points
     columns, rows = np.rint(points).astype(int).T
     return points[mask[rows, columns] > 0]
+
+
+def _corners() -> Any:
+    from thesis_repro.odometry import corners  # loads the compiler, which most runs do without
+
+    return corners
 
 
 def _check_number(number: int) -> None:

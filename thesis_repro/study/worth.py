@@ -361,7 +361,14 @@ def _measure_one(
 ) -> None:
     chosen, calls = choices(sequence, sources, width, number, **options)
     description = f"worth of keypoints, {sequence.name}"
-    results.write_table(file, worth(sequence, chosen, calls=calls, description=description))
+    try:
+        table = worth(sequence, chosen, calls=calls, description=description)
+    except InputError:
+        raise
+    except Exception as error:  # of own keypoints
+        reason = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
+        raise InputError(f"{sequence.folder}: {reason}") from error
+    results.write_table(file, table)
 
 
 # Over several streets
