@@ -1,5 +1,7 @@
 """The names of the package but build_unet, which needs TensorFlow."""
 
+# ruff: noqa: F401  they are imported for others
+
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.mask_files import LabelMasks
 from thesis_repro.masks import MaskSettings, keypoint_mask
@@ -16,24 +18,3 @@ from thesis_repro.odometry import (
 )
 from thesis_repro.odometry.estimators import refined
 from thesis_repro.odometry.keypoints import filled, filtered, orb, spread
-
-__all__ = [
-    "THESIS",
-    "LabelMasks",
-    "MaskSettings",
-    "Masks",
-    "Matches",
-    "Odometry",
-    "OdometrySettings",
-    "Result",
-    "Sequence",
-    "Step",
-    "filled",
-    "filtered",
-    "keypoint_mask",
-    "orb",
-    "refined",
-    "run",
-    "run_many",
-    "spread",
-]

@@ -172,6 +172,17 @@ def test_own_keypoints_are_found_and_tracked_by_their_own_functions():
     assert (table.loc["still", "rotation_deg"] != table.loc["tracked", "rotation_deg"]).all()
 
 
+def test_what_the_camera_did_not_see_has_no_keypoints(monkeypatch):
+    street = Street(3)
+    visible = np.zeros_like(street.frame(0))
+    visible[:, : visible.shape[1] // 2] = 255
+    choices = {("all", 0): (THESIS, None)}
+    whole = worth.worth(street, choices)
+    monkeypatch.setattr(street, "visible", lambda index: visible)
+    half = worth.worth(street, choices)
+    assert 0 < half["keypoints"].max() < 0.8 * whole["keypoints"].min()
+
+
 def test_steps_without_lengths_are_all_kept_and_short_ones_are_not():
     street = Street(4)
     street.poses[2:, :3, 3] = street.poses[1, :3, 3]  # the last two steps are short

@@ -193,7 +193,7 @@ def figure_sources(study: Study, runs: pd.DataFrame) -> Figure:
         style.show_image(first, frame, f"{source.name}: frame {index}")
         if source.kind == "keypoints":
             second.set_axis_off()
-            points = own_calls(source.folder).detect(frame, THESIS, None)
+            points = own_calls(source.folder).detect(frame, THESIS, sequence.visible(index))
         else:
             masks = source.masks(sequence, study.shown_width)
             if isinstance(masks, LabelMasks):

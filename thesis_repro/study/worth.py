@@ -74,7 +74,7 @@ from thesis_repro.odometry import (
 from thesis_repro.odometry.keypoints import filled, spread
 from thesis_repro.odometry.odometry import MIN_MATCHES, PROBABILITY, normalise
 from thesis_repro.odometry.refined.fit import fit, smaller_rotation
-from thesis_repro.odometry.runs import check
+from thesis_repro.odometry.runs import check, inside
 from thesis_repro.odometry.sharing import SharedCalls
 from thesis_repro.running import results
 from thesis_repro.running.files import progress
@@ -174,13 +174,14 @@ def tracked(
 ) -> tuple[Tracks, dict[tuple[str, int], Tracks]]:
     """Return all keypoints of frame `index`, and those of each choice, tracked into the next."""
     frame, following = sequence.frame(index), sequence.frame(index + 1)
+    visible = sequence.visible(index)
     made = {id(masks): masks[index] for _, masks in choices.values() if masks is not None}
     everything = {_RANDOM: (THESIS, None), **choices}
     tracks = {}
     alike: dict[tuple, dict] = {}  # keypoints that are tracked in the same way, at once
     for key, (settings, masks) in everything.items():
         own = calls.get(key[0], shared.calls)
-        points = own.detect(frame, settings, made.get(id(masks)))
+        points = own.detect(frame, settings, inside(visible, made.get(id(masks))))
         how = (settings.window, settings.levels, key if key[0] in calls else None)
         alike.setdefault(how, {})[key] = points
     for (*_, own_key), group in alike.items():
