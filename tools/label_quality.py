@@ -99,7 +99,7 @@ def _of_embedded_world():
             "mean IoU": mean_iou,
             "mean IoU from": where,
             "odometry": RENDERED,
-            "sequences": f"{row['sequences']} drives",
+            "sequences": f"{row['sequences']} rendered drives",
             "over": ALL_KEYPOINTS,
             **{label: row[label] for label in compare.JUDGING_METRICS.values()},
             "failed runs": row["failed runs"],
