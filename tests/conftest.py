@@ -4,6 +4,12 @@ import fcntl
 import os
 from contextlib import contextmanager
 
+# Tests run in as many processes as there are cores, so threads of a library would only compete. The
+# variables are read when the libraries are loaded, here and in the commands that tests start.
+os.environ |= dict.fromkeys(
+    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"), "1"
+)
+
 from thesis_repro import segmentation  # noqa: F401  sets what TensorFlow reads at its import
 
 # isort: split
@@ -31,6 +37,7 @@ SLOW_FIXTURES = {
     "kitti_real",
     "camvid_real",
     "reference",
+    "executed",
 }
 
 
@@ -93,7 +100,23 @@ def small_world(tmp_path_factory):
     from thesis_repro.running.settings import PROFILES
 
     with _shared_folder(tmp_path_factory, "small_world") as folder:  # rendered once
-        dataset.write(folder, **PROFILES["smoke"].world, seed=0)
+        dataset.write(folder, **PROFILES["smoke"].world, seed=0, jobs=1)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def executed(small_world, tmp_path_factory):
+    """A folder with build and figures of a run in which every notebook was executed.
+
+    Tests must not change it.
+    """
+    import executing
+
+    with _shared_folder(tmp_path_factory, "executed") as folder:
+        if not folder.exists():
+            executing.execute(folder, small_world)
+            (folder / "done").touch()
+        assert (folder / "done").exists(), "a notebook failed in another process"
     return folder
 
 
