@@ -6,17 +6,16 @@ import os
 import sys
 import warnings
 
-from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 END = "# after the last cell"  # of a notebook, a cell that the tests append
 
 
-def problems(figure, draw=Figure.draw_without_rendering):
-    """Messages about the faults of a figure; none if it has no faults. draw: draws it."""
+def problems(figure):
+    """Messages about the faults of a figure; none if it has no faults."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        draw(figure)
+        figure.draw_without_rendering()
     faults = [str(warning.message) for warning in caught]
     texts = _visible_texts(figure)
     faults += [
@@ -81,8 +80,8 @@ class Watch:
 
         @functools.wraps(save_figure)
         def checked(figure, folder, name, note):
-            faults = problems(figure, lambda figure: save_figure(figure, folder, name, note))
-            self.report(*(f"{name}: {fault}" for fault in ["saved", *faults]))
+            self.report(*(f"{name}: {fault}" for fault in ["saved", *problems(figure)]))
+            save_figure(figure, folder, name, note)
 
         def remembered(draw, **sliders):
             self.with_sliders.append((draw, sliders))
