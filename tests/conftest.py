@@ -18,16 +18,19 @@ import numpy as np
 import pytest
 import trials
 
-# the files that take longest, longest first
+# The files that take longest, longest first. The evidence waits for the notebooks, which the first
+# file executes.
 LONGEST = (
     "test_executed.py",
-    "test_edits.py",
-    "test_install.py",
     "test_training.py",
-    "test_dask.py",
     "test_prediction.py",
+    "test_dask.py",
     "test_odometry.py",
     "test_study.py",
+    "test_own_sources.py",
+    "test_runner.py",
+    "test_edits.py",
+    "test_tools.py",
 )
 # fixtures that take seconds
 SLOW_FIXTURES = {

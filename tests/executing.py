@@ -18,6 +18,10 @@ sys.path.append({tests!r})
 from drawn import Watch
 Watch(get_ipython(), {folder!r})
 """
+# that cells show; those that are saved are as usual
+SMALL_PICTURES = """
+get_config().InlineBackend.print_figure_kwargs = {"bbox_inches": None, "dpi": 40}
+"""
 
 
 def run_of(folder):
@@ -39,9 +43,11 @@ def execute(folder, world):
     (run / "notebooks").mkdir(parents=True)
     (run / "checked").touch()  # as if make had checked the data
     (folder / "build/world-smoke").symlink_to(world)
-    startup = folder / "ipython/profile_default/startup/watch.py"
-    startup.parent.mkdir(parents=True)
-    startup.write_text(STARTUP.format(tests=str(Path(__file__).parent), folder=str(folder)))
+    profile = folder / "ipython/profile_default"
+    (profile / "startup").mkdir(parents=True)
+    watch = STARTUP.format(tests=str(Path(__file__).parent), folder=str(folder))
+    (profile / "startup/watch.py").write_text(watch)
+    (profile / "ipython_kernel_config.py").write_text(SMALL_PICTURES)
     variables = {name: os.environ[name] for name in KEPT if name in os.environ}
     variables |= {"IPYTHONDIR": str(folder / "ipython"), "PYTHONPATH": str(ROOT)} | run_of(folder)
     for name in NOTEBOOKS:

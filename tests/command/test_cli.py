@@ -63,7 +63,7 @@ def test_a_command_shows_two_valid_examples(name):
 
 
 def test_written_masks_give_the_same_path_as_label_maps(small_world, small_labels, tmp_path):
-    where = ["--kitti", small_world / "kitti", "--sequence", "00"]
+    where = ["--kitti", small_world / "kitti", "--sequence", "00", "--frames", 6]
     labels = ["--labels", small_labels / "00", "--dilation"]
     corrected = "--boundaries exact --symmetric --without-movable --classes road --margin 4"
     paths = []
