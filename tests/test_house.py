@@ -78,8 +78,8 @@ def test_rooms_import_only_rooms_below_them():
 
 
 def test_the_page_of_the_odometry_needs_no_other_room():
-    page = MODULES["odometry.odometry"]
-    assert imports(tree_of(page), "odometry.odometry") == {
+    page = MODULES["odometry.loop"]
+    assert imports(tree_of(page), "odometry.loop") == {
         "errors",
         "odometry.settings",
         "odometry.types",

@@ -21,7 +21,7 @@ from thesis_repro.data.kitti import Sequence
 from thesis_repro.mask_files import LabelMasks
 from thesis_repro.masks import MaskSettings
 from thesis_repro.odometry import THESIS, OdometrySettings, estimators, keypoints, metrics
-from thesis_repro.odometry.odometry import detect, normalise, track
+from thesis_repro.odometry.loop import detect, normalise, track
 from thesis_repro.odometry.runs import Masks
 from thesis_repro.running import results
 from thesis_repro.study.jobs import CONTROL_WIDTH, Job

@@ -17,7 +17,7 @@ from reference_steps import ESTIMATORS, FOLDER, STEPS, digest
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.mask_files import MaskFolder
 from thesis_repro.odometry import OPENCV, THESIS, Matches, metrics
-from thesis_repro.odometry.odometry import PROBABILITY, VoteOfAll, normalise
+from thesis_repro.odometry.loop import PROBABILITY, VoteOfAll, normalise
 from thesis_repro.odometry.refined import RefinedEstimator
 
 CALLS = {

@@ -10,7 +10,7 @@ from evo.main_ape import ape
 from scipy.spatial.transform import Rotation
 
 from thesis_repro.errors import InputError
-from thesis_repro.odometry.odometry import MAX_TURN
+from thesis_repro.odometry.loop import MAX_TURN
 
 
 def rmse(estimated: np.ndarray, true: np.ndarray) -> float:

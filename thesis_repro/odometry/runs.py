@@ -10,7 +10,7 @@ import pandas as pd
 
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
-from thesis_repro.odometry.odometry import PROBABILITY, STATIONARY, Calls, Odometry, detect
+from thesis_repro.odometry.loop import PROBABILITY, STATIONARY, Calls, Odometry, detect
 from thesis_repro.odometry.settings import THESIS, OdometrySettings
 from thesis_repro.odometry.types import EQUAL, FRAME_COLUMNS, ROTATION_COLUMNS, TIMED_PARTS
 from thesis_repro.running import messages
@@ -104,7 +104,7 @@ def run(
     """Run the odometry over a kitti.Sequence. Returns a Result.
 
     masks: see Masks. description: text of the progress bar; None for no bar. calls: functions in
-    place of OpenCV's, see odometry.Calls. Without them, a long run takes faster ones with the same
+    place of OpenCV's, see loop.Calls. Without them, a long run takes faster ones with the same
     bits.
     Raises InputError if a frame cannot be read, if a mask and its frame differ in size, if there
     are fewer masks than frames, and for another kind of sequence, settings or masks.

@@ -11,7 +11,7 @@ import numpy as np
 
 import opencv_exact
 from thesis_repro.odometry import corners
-from thesis_repro.odometry.odometry import PROBABILITY, TERMINATION, Calls, Odometry
+from thesis_repro.odometry.loop import PROBABILITY, TERMINATION, Calls, Odometry
 from thesis_repro.odometry.settings import THESIS, OdometrySettings
 
 
@@ -67,7 +67,7 @@ class SharedCalls:
         points: np.ndarray,
         settings: OdometrySettings = THESIS,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Like `odometry.track`. Points that `expect` has tracked are looked up."""
+        """Like `loop.track`. Points that `expect` has tracked are looked up."""
         tracks = self._tracks
         is_usual = (settings.window, settings.levels) == (THESIS.window, THESIS.levels)
         if tracks is None or tracks.previous is not previous or not is_usual:
@@ -96,7 +96,7 @@ class SharedCalls:
     def find_essential_matrix(
         self, current: np.ndarray, previous: np.ndarray, threshold: float
     ) -> tuple[np.ndarray | None, np.ndarray | None]:
-        """Like `odometry.find_essential_matrix`."""
+        """Like `loop.find_essential_matrix`."""
         key = (current.tobytes(), previous.tobytes(), threshold)
         if key not in self._matrices:
             self._matrices[key] = opencv_exact.find_essential_matrix(
@@ -121,7 +121,7 @@ def track(
     points: np.ndarray,
     settings: OdometrySettings = THESIS,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Track points (N, 2) as `odometry.track` does, in less time.
+    """Track points (N, 2) as `loop.track` does, in less time.
 
     Points are sorted by row, so that the pixels of neighbouring points are still in the processor's
     cache. The matching error is not computed, because nothing uses it. Computing it, OpenCV also

@@ -71,7 +71,7 @@ def motion_of_vote(votes: int, rotation: np.ndarray, translation: np.ndarray) ->
 class Estimator(Protocol):
     """Completes the motion of a step: an essential matrix allows four motions.
 
-    With a method `search(current, previous, threshold)`, as odometry.find_essential_matrix, it
+    With a method `search(current, previous, threshold)`, as loop.find_essential_matrix, it
     brings its own search in place of RANSAC. Flags such as "no agreement" follow from its inliers.
     """
 

@@ -17,7 +17,7 @@ from thesis_repro.errors import one_line
 from thesis_repro.mask_files import LabelMasks, label_map_of
 from thesis_repro.masks import MaskSettings
 from thesis_repro.odometry import THESIS, metrics
-from thesis_repro.odometry.odometry import detect
+from thesis_repro.odometry.loop import detect
 from thesis_repro.odometry.runs import inside
 from thesis_repro.report import comparison, findings, page, paths, style, worth
 from thesis_repro.running import results

@@ -72,7 +72,7 @@ from thesis_repro.odometry import (
     scales,
 )
 from thesis_repro.odometry.keypoints import filled, spread
-from thesis_repro.odometry.odometry import MIN_MATCHES, PROBABILITY, normalise
+from thesis_repro.odometry.loop import MIN_MATCHES, PROBABILITY, normalise
 from thesis_repro.odometry.refined.fit import fit, smaller_rotation
 from thesis_repro.odometry.runs import check, inside
 from thesis_repro.odometry.sharing import SharedCalls
