@@ -27,7 +27,7 @@ from thesis_repro.odometry import (
 )
 from thesis_repro.odometry.estimators import ESTIMATORS, refined
 from thesis_repro.odometry.loop import VoteOfAll, detect, normalise, track
-from thesis_repro.odometry.types import ROTATION_COLUMNS
+from thesis_repro.odometry.step import ROTATION_COLUMNS
 
 SMALL = replace(THESIS, max_keypoints=500)  # quicker
 COUNTS = {

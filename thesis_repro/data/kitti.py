@@ -1,7 +1,6 @@
 """KITTI odometry: frames, camera, times and ground truth of a sequence or a raw drive."""
 
 import re
-from collections import namedtuple
 from collections.abc import Iterator
 from copy import copy
 from decimal import Decimal
@@ -13,6 +12,7 @@ import cv2
 import numpy as np
 
 from thesis_repro.data import cameras, kitti_raw
+from thesis_repro.data.geometry import CAMERAS, check_camera, is_camera_matrix
 from thesis_repro.data.trajectories import (
     have_times,
     read_poses,
@@ -24,25 +24,6 @@ from thesis_repro.errors import InputError
 from thesis_repro.running import messages
 from thesis_repro.running.files import images, read_gray
 
-# Intrinsics in pixels at the stated image size (Section 3.7.2); KITTI's gray images have no
-# distortion.
-Camera = namedtuple("Camera", "width height fx fy cx cy")
-_CAMERA_00 = Camera(1241, 376, 718.856, 718.856, 607.1928, 185.2157)
-_CAMERA_03 = Camera(1242, 375, 721.5377, 721.5377, 609.5593, 172.854)
-_CAMERA_04 = Camera(1226, 370, 707.0912, 707.0912, 601.8873, 183.1104)
-CAMERAS = {
-    "00": _CAMERA_00,
-    "01": _CAMERA_00,
-    "02": _CAMERA_00,
-    "03": _CAMERA_03,
-    **{f"{n:02d}": _CAMERA_04 for n in range(4, 11)},
-}
-# width and height that go with a focal length and a centre's u, which tell KITTI's cameras apart
-KNOWN_SIZES = {
-    (round(camera.fx, 3), round(camera.cx, 3)): (camera.width, camera.height)
-    for camera in CAMERAS.values()
-}
-
 # left gray, left colour, then the right ones
 IMAGE_FOLDERS = ("image_0", "image_2", "image_1", "image_3")
 # names of cameras' lines in the calibration
@@ -52,7 +33,6 @@ CALIBRATION_KEYS = {
 }
 TRUE_LABELS = "labels_0"  # exact label maps beside image_0, which only the embedded world has
 DECIMAL = re.compile(r"\d+\.\d+")  # names of frames that may be seconds
-MIN_FRAME_SIDE = 16  # pixels; keypoints cannot be tracked in smaller frames
 # Pixels near a border where keypoints are left out: half a window of the tracker, which would see
 # the border's edge
 BORDER_MARGIN = 10
@@ -512,44 +492,3 @@ def read_intrinsics(path: str | Path, camera: str = "image_0") -> np.ndarray:
     if not is_camera_matrix(matrix):
         raise InputError(f"{path}: {form}")
     return matrix
-
-
-def is_camera_matrix(matrix: np.ndarray) -> bool:
-    """Whether a matrix is that of Equation 2.4, (3, 3), without skew."""
-    if matrix.shape != (3, 3) or not np.isfinite(matrix).all():
-        return False
-    (fx, _, u), (_, fy, v), _ = matrix
-    return min(fx, fy) > 0 and np.array_equal(matrix, [[fx, 0, u], [0, fy, v], [0, 0, 1]])
-
-
-def check_camera(
-    path: Path | str,
-    intrinsics: np.ndarray,
-    frame: Path | str,
-    size: tuple[int, int],
-    stated: tuple[int, int] | None = None,
-) -> None:
-    """Raise InputError if frames are too small or do not fit the camera.
-
-    size: height and width. stated: those that the camera's file says its frames have.
-    """
-    height, width = size
-    if min(size) < MIN_FRAME_SIDE:
-        raise InputError(
-            f"{frame}: {width}x{height} pixels; each side needs {MIN_FRAME_SIDE} or more"
-        )
-    (fx, _, u), (_, fy, v), _ = intrinsics
-    if stated is None:
-        stated = KNOWN_SIZES.get((round(fx, 3), round(u, 3)), (width, height))[::-1]
-    if stated != size:
-        raise InputError(
-            f"{path}: is for frames of {stated[1]}x{stated[0]} pixels, but {frame} has "
-            f"{width}x{height}; scale or shift focal lengths and centre as the frames were"
-        )
-    center_fits = 0 <= u <= width and 0 <= v <= height
-    focal_lengths_fit = all(width / 100 < focal < width * 100 for focal in (fx, fy))
-    if not (center_fits and focal_lengths_fit):
-        raise InputError(
-            f"{path}: focal lengths {fx:g}, {fy:g} and centre {u:g}, {v:g} do not fit frames of "
-            f"{width}x{height} pixels"
-        )

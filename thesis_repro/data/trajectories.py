@@ -5,10 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
+from thesis_repro.data.geometry import are_poses
 from thesis_repro.errors import InputError
 from thesis_repro.running.files import write_text
-
-ROTATION_TOLERANCE = 1e-3  # largest entry of R R^T - I; pose files have few digits
 
 
 def text_of(path: str | Path) -> str:
@@ -115,20 +114,6 @@ def read_poses_at(path: Path, times: np.ndarray) -> tuple[np.ndarray, np.ndarray
         raise InputError(f"{path}: must hold finite positions and unit quaternions")
     indices, first = np.unique(np.searchsorted(times, frames.timestamps), return_index=True)
     return indices, poses[first]
-
-
-def are_poses(poses: np.ndarray) -> np.ndarray:
-    """Whether each of (n, 4, 4) is a right-handed rotation and a position in metres.
-
-    Returns (n,) booleans.
-    """
-    rotations = poses[:, :3, :3]
-    with np.errstate(over="ignore", invalid="ignore"):
-        products = rotations @ rotations.transpose(0, 2, 1)
-        errors = np.abs(products - np.eye(3)).max(axis=(1, 2))
-        is_right_handed = np.linalg.det(rotations) > 0
-    is_pose = (poses[:, 3] == [0, 0, 0, 1]).all(axis=1)
-    return is_pose & (errors <= ROTATION_TOLERANCE) & is_right_handed
 
 
 def write_kitti_poses(path: str | Path, poses: np.ndarray) -> None:

@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 
 from thesis_repro.errors import need
-from thesis_repro.odometry import types
+from thesis_repro.odometry import inputs
 from thesis_repro.odometry.settings import THESIS, OdometrySettings
-from thesis_repro.odometry.types import NO_POINTS, Matches, Motion, Step
+from thesis_repro.odometry.step import NO_POINTS, Estimator, Matches, Motion, Step, motion_of_vote
 
 PROBABILITY = 0.999  # that RANSAC has tried a sample without wrong matches
 TERMINATION = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 0.01)  # of the tracker
@@ -121,9 +121,9 @@ class VoteOfAll(NamedTuple):
     calls: Calls = OPENCV
 
     def motion(self, essential: np.ndarray, matches: Matches, scale: float, moves: bool) -> Motion:
-        """Return the motion of a step (see types.Estimator)."""
+        """Return the motion of a step (see step.Estimator)."""
         voted = self.calls.recover_pose(essential, matches.current, matches.previous)
-        return types.motion_of_vote(*voted)
+        return motion_of_vote(*voted)
 
 
 class Odometry:
@@ -143,11 +143,11 @@ class Odometry:
         Raises InputError for another matrix, and for a start that is no pose.
         """
         need("settings", settings, OdometrySettings)
-        self.intrinsics = types.camera_matrix(intrinsics)
+        self.intrinsics = inputs.camera_matrix(intrinsics)
         self.settings = settings
         self.calls = calls or OPENCV._replace(detect=settings.detector or detect)
-        self.estimator: types.Estimator = (settings.estimator or VoteOfAll)(self.calls)
-        self.pose = types.start_pose(start)
+        self.estimator: Estimator = (settings.estimator or VoteOfAll)(self.calls)
+        self.pose = inputs.start_pose(start)
         self.count = 0  # of frames so far
         self.previous: np.ndarray | None = None  # the frame in which self.points lie
         self.points = NO_POINTS
@@ -160,11 +160,11 @@ class Odometry:
         size, uint8 or bool; keypoints lie only where it is not 0.
         Raises InputError for a frame, scale or mask of another kind.
         """
-        frame = types.gray_frame(frame, self.count, self.intrinsics, self.previous)
-        mask = types.allowed_pixels(mask, self.count, frame)
-        step = Step(self.count, types.step_length(scale, self.count) + self.skipped_metres)
+        frame = inputs.gray_frame(frame, self.count, self.intrinsics, self.previous)
+        mask = inputs.allowed_pixels(mask, self.count, frame)
+        step = Step(self.count, inputs.step_length(scale, self.count) + self.skipped_metres)
         self.count += 1
-        step.flags += types.reasons_to_skip(frame, self.previous)
+        step.flags += inputs.reasons_to_skip(frame, self.previous)
         if step.flags:
             self.skipped_metres = step.scale
         else:

@@ -10,9 +10,10 @@ import pandas as pd
 
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
+from thesis_repro.odometry.inputs import EQUAL
 from thesis_repro.odometry.loop import PROBABILITY, STATIONARY, Calls, Odometry, detect
 from thesis_repro.odometry.settings import THESIS, OdometrySettings
-from thesis_repro.odometry.types import EQUAL, FRAME_COLUMNS, ROTATION_COLUMNS, TIMED_PARTS
+from thesis_repro.odometry.step import FRAME_COLUMNS, ROTATION_COLUMNS, TIMED_PARTS
 from thesis_repro.running import messages
 from thesis_repro.running.files import progress
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from thesis_repro.odometry.refined.fit import fit, smaller_rotation
 from thesis_repro.odometry.refined.motion_prior import MotionPrior, check_consistency
-from thesis_repro.odometry.types import Matches, Motion
+from thesis_repro.odometry.step import Matches, Motion
 
 
 class RefinedEstimator:
@@ -17,7 +17,7 @@ class RefinedEstimator:
         self.prior = MotionPrior.straight_ahead()
 
     def motion(self, essential: np.ndarray, matches: Matches, scale: float, moves: bool) -> Motion:
-        """Return the motion of a step (see types.Estimator), flagged if it is not consistent.
+        """Return the motion of a step (see step.Estimator), flagged if it is not consistent.
 
         A step that does not move the pose is not compared with the step before, and the next one is
         not compared with it.

@@ -16,7 +16,7 @@ from opencv_exact import epipolar
 from opencv_exact.compiling import compiled, inlined
 from thesis_repro.odometry.refined import matrices
 from thesis_repro.odometry.refined.normal_equations import normal_equations
-from thesis_repro.odometry.types import Matches, Motion
+from thesis_repro.odometry.step import Matches, Motion
 
 MIN_MATCHES = 5  # that determine a motion
 MAX_ITERATIONS = 10

@@ -16,7 +16,7 @@ import numpy as np
 
 from thesis_repro.odometry.refined.fit import RefinedMotion, fit, near
 from thesis_repro.odometry.refined.guided import ransac_with_prior
-from thesis_repro.odometry.types import Matches
+from thesis_repro.odometry.step import Matches
 
 MAX_ROTATION_CHANGE, MAX_HEADING_CHANGE = 1.5, 20.0  # degrees
 MAX_FIRST_ROTATION = 5.0  # degrees: KITTI's cars turn by up to 4.8 a frame
