@@ -143,7 +143,7 @@ def odometry(options: Any) -> None:
 def study(options: Any) -> int:
     """Compare your own masks, keypoints or paths with all keypoints and with controls."""
     from thesis_repro import checks
-    from thesis_repro.data import kitti
+    from thesis_repro.data import kitti, layout
     from thesis_repro.running import results
     from thesis_repro.study import sources
     from thesis_repro.study.study import Study
@@ -164,7 +164,7 @@ def study(options: Any) -> int:
     if has_labels:
         all_widths = ALL_WIDTHS if mask_settings.has_width else ()
         widths = widths.union(*options.widths or [all_widths])
-    names = dict.fromkeys(kitti.locate(options.kitti, name)[1].name for name in options.sequences)
+    names = dict.fromkeys(layout.locate(options.kitti, name)[1].name for name in options.sequences)
     planned = Study(
         options.kitti.absolute(),
         tuple(names or kitti.sequences(options.kitti)),
@@ -320,17 +320,17 @@ def _image_folders(root: Path) -> Iterator[tuple[Path, list[Path]]]:
     The path is a folder of images, a sequence, a KITTI folder or a folder of sequences.
     Raises InputError if there are no images.
     """
-    from thesis_repro.data import kitti
+    from thesis_repro.data import layout
 
     folders = [root]
-    if root.is_dir() and not kitti.has_frames(root):
-        parent = kitti.folder_of(root)
+    if root.is_dir() and not layout.has_frames(root):
+        parent = layout.sequences_folder(root)
         if not parent.is_dir():
             parent = root
-        folders = kitti.folders_with_frames(parent) or [root]
+        folders = layout.folders_with_frames(parent) or [root]
     for folder in folders:
-        image_folder = kitti.images_of(folder)
-        paths = kitti.frames_in(image_folder)
+        image_folder = layout.frame_folder(folder)
+        paths = layout.frames_in(image_folder)
         if not paths:
             raise InputError(f"{image_folder}: holds no PNG or JPEG images")
         yield folder, paths
