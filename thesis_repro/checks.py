@@ -17,7 +17,7 @@ import numpy as np
 
 from thesis_repro.data import cityscapes, kitti
 from thesis_repro.errors import InputError, one_line
-from thesis_repro.mask_files import LabelMasks, MaskFolder, label_map_of
+from thesis_repro.mask_files import LabelMasks, MaskFolder
 from thesis_repro.masks import coverage
 from thesis_repro.running import files, messages
 from thesis_repro.running.settings import read_settings
@@ -72,7 +72,7 @@ def check_kitti(root: Path) -> list[str]:
             f"sequence {name}: {len(sequence)} frames of {width}x{height}; with ground truth: "
             f"{sequence.has_truth}; with times: {sequence.has_times}"
         )
-        print("\n".join(f"  {one_line(line)}" for line in [fact, *of_sequence(sequence)]))
+        print("\n".join(f"  {one_line(line)}" for line in [fact, *sequence_warnings(sequence)]))
         checksums: dict[int, int] = {}
 
         def read(index: int, sequence: Any = sequence, checksums: Any = checksums) -> None:
@@ -158,7 +158,7 @@ def main(path: Path) -> int:
 # Warnings, one line each: "place: what is wrong"
 
 
-def of_sequence(sequence: kitti.Sequence) -> list[str]:
+def sequence_warnings(sequence: kitti.Sequence) -> list[str]:
     """Warn of a principal point far from the middle of the frames, and of impossible steps."""
     height, width = sequence.size
     u, v = sequence.intrinsics[:2, 2]
@@ -169,10 +169,10 @@ def of_sequence(sequence: kitti.Sequence) -> list[str]:
             f"sequence {sequence.name}: {sequence.calibration_path.name} has the centre {u:g}, {v:g}, far "
             f"from the middle of frames of {width}x{height} pixels; it must belong to frames of this size"
         )
-    return warnings + _of_steps(sequence)
+    return warnings + _step_warnings(sequence)
 
 
-def _of_steps(sequence: kitti.Sequence) -> list[str]:
+def _step_warnings(sequence: kitti.Sequence) -> list[str]:
     """Warn of steps longer or faster than what drives, and of gaps in the times."""
     intervals = np.diff(sequence.times)
     lengths, unit = sequence.assumed_steps[1:], "times in seconds, and the speed in metres a second"
@@ -201,7 +201,7 @@ def _of_steps(sequence: kitti.Sequence) -> list[str]:
     return warnings
 
 
-def of_run(
+def run_warnings(
     name: str, frames: int, failed: int, dropped: int = 0, scale_gate: float = 0.1
 ) -> list[str]:
     """Warn if many steps of a run failed or were dropped.
@@ -223,7 +223,7 @@ def of_run(
     return warnings
 
 
-def of_masks(source: LabelMasks | MaskFolder) -> list[str]:
+def mask_warnings(source: LabelMasks | MaskFolder) -> list[str]:
     """Warn of what is certainly wrong with masks, seen on MASK_SAMPLES of them.
 
     Raises InputError if one of them cannot be read.
@@ -277,7 +277,7 @@ def _sampled(source: LabelMasks | MaskFolder) -> list[int]:
 
 def _class_shares(source: LabelMasks) -> np.ndarray:
     """Return the share of each label id, (N_CLASSES,), in the sampled label maps."""
-    label_maps = [label_map_of(source, index).ravel() for index in _sampled(source)]
+    label_maps = [source.label_map(index).ravel() for index in _sampled(source)]
     counts = np.bincount(np.concatenate(label_maps), minlength=cityscapes.N_CLASSES)
     return counts / counts.sum()
 

@@ -115,7 +115,7 @@ def odometry(options: Any) -> None:
     if options.tum:
         write_tum(options.tum, result.poses, sequence.times)
     steps = len(sequence), result.failed_steps, result.dropped_steps
-    _warn(checks.of_run(sequence.name, *steps, settings.scale_gate))
+    _warn(checks.run_warnings(sequence.name, *steps, settings.scale_gate))
     if sequence.has_truth:
         reason = metrics.foreign_truth(result.poses, sequence.poses)
         _warn([f"{sequence.poses_path}: {reason}"] * bool(reason))
@@ -199,7 +199,7 @@ def study(options: Any) -> int:
         planned = replace(planned, sequences=tuple(outcome.table["sequence"].unique()))
         runs = outcome.table[outcome.table["method"] == "baseline"].drop_duplicates("sequence")
         of_runs = [
-            checks.of_run(run.sequence, run.frames, run.flagged) for run in runs.itertuples()
+            checks.run_warnings(run.sequence, run.frames, run.flagged) for run in runs.itertuples()
         ]
         warnings += outcome.warnings + _warn(chain(*of_runs))
         worths = None
@@ -298,11 +298,11 @@ def _check_masks(sequence: Any, mask_sets: Iterable) -> list[str]:
     """Print what masks of a sequence hold, and return warnings of doubtful input."""
     from thesis_repro import checks
 
-    warnings = checks.of_sequence(sequence)
+    warnings = checks.sequence_warnings(sequence)
     for masks in mask_sets:
         with suppress(InputError):  # a file that cannot be read is reported when it is used
             messages.log.info(checks.describe_masks(masks, sequence))
-            warnings += checks.of_masks(masks)
+            warnings += checks.mask_warnings(masks)
     return warnings
 
 

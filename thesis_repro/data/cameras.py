@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thesis_repro.data.trajectories import text_of
+from thesis_repro.data.trajectories import read_text
 from thesis_repro.errors import InputError
 
 # k3 may be left out, or all of the distortion
@@ -40,7 +40,7 @@ def read_camera(path: str | Path) -> Camera:
     EuRoC (sensor.yaml), Kalibr (its cam0) or ORB-SLAM have it. Raises InputError for any other
     file, and for a camera of another model, such as a fisheye.
     """
-    text, size = text_of(path), None
+    text, size = read_text(path), None
     try:
         if Path(path).suffix in (".yaml", ".yml"):
             text = text.partition("cam1:")[0]

@@ -23,8 +23,8 @@ from thesis_repro.data.trajectories import (
     have_times,
     read_poses,
     read_poses_at,
+    read_text,
     read_times,
-    text_of,
 )
 from thesis_repro.errors import InputError
 from thesis_repro.running.files import read_gray
@@ -358,7 +358,7 @@ def read_intrinsics(path: str | Path, camera: str = "image_0") -> np.ndarray:
     key = CALIBRATION_KEYS.get(camera, "P0")
     form = f"must hold a line '{key}: f 0 u 0 0 f v 0 0 0 1 0' of a camera without distortion"
     try:
-        lines = [line for line in text_of(path).splitlines() if line.startswith(f"{key}:")]
+        lines = [line for line in read_text(path).splitlines() if line.startswith(f"{key}:")]
         matrix = np.array(lines[0].split()[1:], np.float64).reshape(3, 4)[:, :3]
     except InputError as error:
         raise InputError(f"{error}; it {form}") from None

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from thesis_repro.data.trajectories import text_of
+from thesis_repro.data.trajectories import read_text
 from thesis_repro.errors import InputError
 from thesis_repro.running.files import listed
 
@@ -48,7 +48,7 @@ def read_times(path: str | Path) -> np.ndarray:
 
     Raises InputError unless they increase.
     """
-    lines = text_of(path).strip().splitlines()
+    lines = read_text(path).strip().splitlines()
     try:
         stamps = np.array(lines, "datetime64[ns]")
     except ValueError as error:
@@ -108,7 +108,7 @@ def _imu_poses(measured: np.ndarray) -> np.ndarray:
 
 def _numbers(path: Path, prefix: str, count: int) -> np.ndarray:
     """Return the `count` numbers of a file's first line that begins with a prefix."""
-    lines = [line for line in text_of(path).splitlines() if line.startswith(prefix)]
+    lines = [line for line in read_text(path).splitlines() if line.startswith(prefix)]
     try:
         numbers = np.array(lines[0].removeprefix(prefix).split(), np.float64)
     except (ValueError, IndexError):

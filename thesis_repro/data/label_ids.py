@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from thesis_repro.data.cityscapes import ID, LABELS, TRAINED, read_label_map
-from thesis_repro.data.trajectories import text_of
+from thesis_repro.data.trajectories import read_text
 from thesis_repro.errors import InputError
 from thesis_repro.running.files import read_color, read_ids
 from thesis_repro.running.results import digest_of_file
@@ -32,7 +32,7 @@ def read_table(path: str | Path) -> tuple[bool, dict[int, int]]:
     if path == COLORS:
         # of labels with one colour, the first one is meant: "car" before "license plate"
         return True, {int.from_bytes(label.color): label.id for label in reversed(LABELS)}
-    lines = text_of(path).split("\n")
+    lines = read_text(path).split("\n")
     table = {}
     for number, row in enumerate(csv.reader(lines), 1):
         if not row or row[0] in ("id", "color"):

@@ -10,7 +10,7 @@ from thesis_repro.errors import InputError
 from thesis_repro.running.files import write_text
 
 
-def text_of(path: str | Path) -> str:
+def read_text(path: str | Path) -> str:
     """Text of a file. Raises InputError if it cannot be read, or is not UTF-8."""
     try:
         # some editors begin a file with a byte order mark
@@ -27,7 +27,7 @@ def _read_numbers(path: str | Path, *columns: int) -> tuple[np.ndarray, list[int
     """
     form = f"must hold {columns[0]} finite numbers a line, one line a frame"
     rows, line_numbers = [], []
-    for number, line in enumerate(text_of(path).split("\n"), 1):
+    for number, line in enumerate(read_text(path).split("\n"), 1):
         if not line.strip():
             continue
         try:
@@ -82,7 +82,7 @@ def read_poses(path: str | Path) -> np.ndarray:
 
 def have_times(path: Path) -> bool:
     """Whether the poses of a file have times: in EuRoC's format (.csv), or in TUM's."""
-    lines = [line for line in text_of(path).splitlines() if line.strip() and line[0] != "#"]
+    lines = [line for line in read_text(path).splitlines() if line.strip() and line[0] != "#"]
     return path.suffix == ".csv" or bool(lines and len(lines[0].split()) == 8)
 
 
@@ -100,7 +100,7 @@ def read_poses_at(path: Path, times: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
     nowhere = np.zeros((len(times), 3)), np.tile([1.0, 0, 0, 0], (len(times), 1))
     frames = PoseTrajectory3D(*nowhere, times, name=f"the times of the frames of {path.parent}")
-    lines = [" ".join(line.split()) for line in text_of(path).splitlines()]
+    lines = [" ".join(line.split()) for line in read_text(path).splitlines()]
     file = io.StringIO("\n".join(filter(None, lines)))
     read = file_interface.read_tum_trajectory_file
     if path.suffix == ".csv":

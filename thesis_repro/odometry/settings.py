@@ -75,7 +75,7 @@ class OdometrySettings:
     shuffle_seed: int | None = None
     scale_gate: float = 0.1
 
-    def of_detection(self) -> tuple:
+    def detection_values(self) -> tuple:
         """Return the settings that decide which keypoints are found."""
         return tuple(value for name, value in vars(self).items() if name not in AFTER_DETECTION)
 

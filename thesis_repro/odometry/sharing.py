@@ -87,7 +87,7 @@ class SharedCalls:
         """Find the keypoints of the settings."""
         self._turn_to(frame)
         # the mask is remembered, too, so that no other array gets its identity
-        key = (id(mask), *settings.of_detection())
+        key = (id(mask), *settings.detection_values())
         if key not in self._detected:
             find = settings.detector or corners.detect
             self._detected[key] = mask, find(frame, settings, mask)
