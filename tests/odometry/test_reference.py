@@ -5,7 +5,6 @@ the bit on x86, and elsewhere, where sums are rounded in other ways, within 1e-6
 """
 
 import platform
-from functools import partial
 
 import numpy as np
 import pandas as pd
@@ -17,13 +16,13 @@ from reference_steps import ESTIMATORS, FOLDER, STEPS, digest
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.mask_files import MaskFolder
 from thesis_repro.odometry import OPENCV, THESIS, Matches, metrics
-from thesis_repro.odometry.loop import PROBABILITY, VoteOfAll, normalise
+from thesis_repro.odometry.loop import VoteOfAll, normalise
 from thesis_repro.odometry.refined import RefinedEstimator
 
 CALLS = {
     "opencv": OPENCV,
     "exact": OPENCV._replace(
-        find_essential_matrix=partial(opencv_exact.find_essential_matrix, probability=PROBABILITY),
+        find_essential_matrix=opencv_exact.find_essential_matrix,
         recover_pose=opencv_exact.recover_pose,
     ),
 }

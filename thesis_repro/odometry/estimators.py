@@ -10,21 +10,19 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from thesis_repro.odometry import keypoints
-from thesis_repro.odometry.step import Estimator, Matches, Motion, motion_of_vote
+from thesis_repro.odometry.loop import VoteOfAll
+from thesis_repro.odometry.step import Estimator, Matches, Motion
 
 
-class VoteOfInliers(NamedTuple):
+class VoteOfInliers(VoteOfAll):
     """The motion that most inliers vote for."""
-
-    calls: Any
 
     def motion(self, essential: np.ndarray, matches: Matches, scale: float, moves: bool) -> Motion:
         """Return the motion of a step (see step.Estimator)."""
-        inliers = matches.inliers
-        voted = self.calls.recover_pose(
-            essential, matches.current[inliers], matches.previous[inliers]
+        current, previous = matches.current[matches.inliers], matches.previous[matches.inliers]
+        return super().motion(
+            essential, Matches(current, previous, matches.threshold), scale, moves
         )
-        return motion_of_vote(*voted)
 
 
 def refined(calls: Any) -> Estimator:

@@ -1,7 +1,7 @@
 """Run the odometry over a sequence: one run, or many runs in one pass, which share their work."""
 
 import time
-from collections.abc import Iterable, Mapping, Sized
+from collections.abc import Mapping, Sized
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
@@ -11,10 +11,9 @@ import pandas as pd
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.odometry.inputs import EQUAL
-from thesis_repro.odometry.loop import PROBABILITY, STATIONARY, Calls, Odometry, detect
+from thesis_repro.odometry.loop import STATIONARY, Calls, Odometry, detect
 from thesis_repro.odometry.settings import THESIS, OdometrySettings
 from thesis_repro.odometry.step import FRAME_COLUMNS, ROTATION_COLUMNS, TIMED_PARTS
-from thesis_repro.running import messages
 from thesis_repro.running.files import progress
 
 # Frames from which faster calls with OpenCV's bits pay. To load them takes 2 s, to compile 25 s;
@@ -115,12 +114,9 @@ def run(
     odometry = Odometry(sequence.intrinsics, settings, start_pose(sequence), calls)
     step_lengths = scales(sequence)
     rows = []
-    for index in _indices(sequence, description):
-        started = time.perf_counter()
-        mask = None if masks is None else masks[index]
-        mask_seconds = time.perf_counter() - started
-        frame, mask = sequence.frame(index), inside(sequence.visible(index), mask)
-        step = odometry.step(frame, step_lengths[index], mask)
+    for index in progress(range(len(sequence)), description):
+        ((mask, mask_seconds),) = _masks_of_frame(sequence, index, [masks]).values()
+        step = odometry.step(sequence.frame(index), step_lengths[index], mask)
         rows.append([*step.row().values(), mask_seconds])
     return _result(rows, settings)
 
@@ -134,11 +130,8 @@ def _faster_calls(frames: int, settings: OdometrySettings) -> Calls | None:
 
     if frames < FRAMES_TO_COMPILE and not opencv_exact.is_compiled():
         return None
-
-    def find(current: np.ndarray, previous: np.ndarray, threshold: float) -> tuple:
-        return opencv_exact.find_essential_matrix(current, previous, threshold, PROBABILITY)
-
-    return Calls(settings.detector or detect, sharing.track, find, opencv_exact.recover_pose)
+    search, vote = opencv_exact.find_essential_matrix, opencv_exact.recover_pose
+    return Calls(settings.detector or detect, sharing.track, search, vote)
 
 
 def run_many(
@@ -164,13 +157,13 @@ def run_many(
         )
     step_lengths = scales(sequence)
     rows: dict[str, list[list]] = {name: [] for name in runs}
-    for index in _indices(sequence, description):
+    for index in progress(range(len(sequence)), description):
         frame = sequence.frame(index)
         frame.setflags(write=False)  # so that all runs share it
         together.expect(frame, odometries.values())
-        masks_of_frame = _masks_of_frame(runs, index, sequence.visible(index))
+        made = _masks_of_frame(sequence, index, [masks for _, masks in runs.values()])
         for name, odometry in odometries.items():
-            mask, mask_seconds = masks_of_frame[id(runs[name][1])]
+            mask, mask_seconds = made[id(runs[name][1])]
             step = odometry.step(frame, step_lengths[index], mask)
             step.seconds = dict.fromkeys(TIMED_PARTS, np.nan)
             rows[name].append([*step.row().values(), mask_seconds])
@@ -178,19 +171,16 @@ def run_many(
 
 
 def _masks_of_frame(
-    runs: Mapping[Any, tuple[OdometrySettings, Masks | None]],
-    index: int,
-    visible: np.ndarray | None,
+    sequence: Sequence, index: int, masks_of_runs: list[Masks | None]
 ) -> dict[int, tuple[np.ndarray | None, float]]:
     """The mask of a frame and the seconds to make it, by the identity of the masks object."""
-    masks_of_frame: dict[int, tuple[np.ndarray | None, float]] = {id(None): (visible, 0.0)}
-    for _, masks in runs.values():
-        if masks is not None and id(masks) not in masks_of_frame:
+    visible, made = sequence.visible(index), {}
+    for masks in masks_of_runs:
+        if id(masks) not in made:
             started = time.perf_counter()
-            mask = masks[index]
-            seconds = time.perf_counter() - started
-            masks_of_frame[id(masks)] = inside(visible, mask), seconds
-    return masks_of_frame
+            mask = None if masks is None else masks[index]
+            made[id(masks)] = inside(visible, mask), time.perf_counter() - started
+    return made
 
 
 def inside(visible: np.ndarray | None, mask: Any) -> Any:
@@ -211,19 +201,6 @@ def check(sequence: Any, masks: Any) -> None:
     is_short = isinstance(masks, Sized) and len(masks) < len(sequence)
     if is_short or not isinstance(masks, Masks | None):
         raise InputError(f"masks: must be {len(sequence)} masks, one a frame, such as LabelMasks")
-
-
-def _indices(sequence: Sequence, description: str | None) -> Iterable[int]:
-    """The numbers of the frames, with a progress bar if there is a description.
-
-    A signal to stop waits for the end of a frame.
-    """
-    if description is not None:
-        yield from progress(range(len(sequence)), description)
-        return
-    for index in range(len(sequence)):
-        with messages.unstopped():
-            yield index
 
 
 def _result(rows: list[list], settings: OdometrySettings) -> Result:

@@ -33,6 +33,7 @@ LIMITS = {
     "levels": (0, 10),
     "shuffle_seed": (0, 2**32 - 1),
     "scale_gate": (0, math.inf),
+    "number of keypoints": (1, 2**31 - 1),  # of spread and filled
 }
 
 
@@ -101,10 +102,10 @@ class OdometrySettings:
                 )
         for field in fields(self):
             if field.name in LIMITS:
-                _check_number(field.name, getattr(self, field.name), field.type)
+                check_number(field.name, getattr(self, field.name), field.type)
 
 
-def _check_number(name: str, value: Any, kind: Any) -> None:
+def check_number(name: str, value: Any, kind: Any) -> None:
     """Raise InputError unless a setting is a number of its kind, a type, and within its LIMITS."""
     if value is None and kind == int | None:
         return

@@ -11,7 +11,7 @@ import numpy as np
 
 import opencv_exact
 from thesis_repro.odometry import corners
-from thesis_repro.odometry.loop import PROBABILITY, TERMINATION, Calls, Odometry
+from thesis_repro.odometry.loop import TERMINATION, Calls, Odometry
 from thesis_repro.odometry.settings import THESIS, OdometrySettings
 
 
@@ -99,9 +99,7 @@ class SharedCalls:
         """Like `loop.find_essential_matrix`."""
         key = (current.tobytes(), previous.tobytes(), threshold)
         if key not in self._matrices:
-            self._matrices[key] = opencv_exact.find_essential_matrix(
-                current, previous, threshold, PROBABILITY
-            )
+            self._matrices[key] = opencv_exact.find_essential_matrix(current, previous, threshold)
         return self._matrices[key]
 
     def _turn_to(self, frame: np.ndarray) -> None:

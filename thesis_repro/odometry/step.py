@@ -53,15 +53,6 @@ class Motion:
     flag: str = ""
 
 
-def motion_of_vote(votes: int, rotation: np.ndarray, translation: np.ndarray) -> Motion:
-    """Return the motion that won a vote.
-
-    If no match votes, PySLAM keeps the first of the four motions. Which one that is depends on the
-    processor, so the motion gets a flag.
-    """
-    return Motion(rotation, translation, votes, "" if votes else "no votes")
-
-
 class Estimator(Protocol):
     """Completes the motion of a step: an essential matrix allows four motions.
 

@@ -171,12 +171,12 @@ class _Bar(tqdm):
 
 def progress(
     iterable: Iterable | None = None,
-    description: str = "",
+    description: str | None = "",
     total: int | None = None,
     unit: str = "frame",
     initial: int = 0,
 ) -> tqdm:
-    """Return a tqdm progress bar on standard error.
+    """Return a tqdm progress bar on standard error; without a description, it shows nothing.
 
     THESIS_REPRO_PROGRESS may name another file: `make figures` names its terminal, for the bars
     inside notebooks. Ctrl-C waits for the end of a step of the loop.
@@ -186,6 +186,7 @@ def progress(
         "mininterval": 0.2,
         "leave": False,
         "delay": DELAY,
+        "disable": description is None,
     }
     if type(sys.stderr).__module__ == "ipykernel.iostream":  # a notebook shows it as an error
         options["file"] = sys.stdout
