@@ -31,7 +31,6 @@ class RefinedEstimator:
 
 
 def _in_order_of_ransac(matches: Matches) -> Matches:
-    assert matches.inliers is not None  # a step with an essential matrix has them
     return replace(
         matches,
         current=matches.current[matches.order],

@@ -90,8 +90,6 @@ def check_consistency(
     if not _is_determined(motion):
         expected = replace(motion, rotation=rotation, translation=translation)
         return expected, prior, NOT_DETERMINED
-    # a fitted motion has both
-    assert motion.rotation is not None and motion.translation is not None
     # copies, because the caller may change what a step returns
     return motion, MotionPrior(motion.rotation.copy(), motion.translation.copy(), scale), flag
 
@@ -117,7 +115,6 @@ def is_consistent(motion: RefinedMotion, scale: float, prior: MotionPrior) -> bo
 
     scale: length of the step, metres.
     """
-    assert motion.rotation is not None and motion.translation is not None
     if not _is_determined(motion):
         return False
     difference = prior.expected_rotation(scale).T @ motion.rotation
