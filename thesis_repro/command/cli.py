@@ -329,11 +329,7 @@ def _image_folders(root: Path) -> Iterator[tuple[Path, list[Path]]]:
             parent = root
         folders = layout.folders_with_frames(parent) or [root]
     for folder in folders:
-        image_folder = layout.frame_folder(folder)
-        paths = layout.frames_in(image_folder)
-        if not paths:
-            raise InputError(f"{image_folder}: holds no PNG or JPEG images")
-        yield folder, paths
+        yield folder, layout.frames_in(layout.frame_folder(folder))
 
 
 def _mask_settings(options: Any, has_labels: bool = True) -> Any:

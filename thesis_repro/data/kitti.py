@@ -21,9 +21,9 @@ from thesis_repro.data.layout import (
 )
 from thesis_repro.data.trajectories import (
     have_times,
+    read_line,
     read_poses,
     read_poses_at,
-    read_text,
     read_times,
 )
 from thesis_repro.errors import InputError
@@ -114,21 +114,19 @@ class Sequence:
         self.border: np.ndarray | None = None  # see `without_border`
         image_folder = frame_folder(self.folder, camera)
         self.frame_paths = frames_in(image_folder)
-        if not self.frame_paths:
-            raise InputError(f"{image_folder}: holds no PNG or JPEG frames")
         camera_folder, self.calibration_path = image_folder, self.folder / "calib.txt"
         self.times_path = self.folder / "times.txt"
         if kitti_raw.is_drive(self.folder):
             camera_folder = image_folder.parent
             self.calibration_path = kitti_raw.calibration(self.folder)
             self.times_path = camera_folder / kitti_raw.TIMES
-        self.distortion, self.stated_size = np.empty(0), None
         if calibration is not None:
             self.calibration_path = Path(calibration)
-            camera_of_file = cameras.read_camera(calibration)
-            self.intrinsics, self.distortion, self.stated_size = camera_of_file
+            matrix, distortion, stated_size = cameras.read_camera(calibration)
         else:
-            self.intrinsics = read_intrinsics(self.calibration_path, camera_folder.name)
+            matrix = read_intrinsics(self.calibration_path, camera_folder.name)
+            distortion, stated_size = np.empty(0), None
+        self.intrinsics, self.distortion, self.stated_size = matrix, distortion, stated_size
         self.has_times = self.times_path.exists()
         self.times = self._read_times(self.times_path, fps)
         self.has_truth = truth is not None or self.poses_path.exists()
@@ -276,9 +274,8 @@ class Sequence:
         )
 
     def frames(self) -> Iterator[np.ndarray]:
-        """Yield the frames in order."""
-        for index in range(len(self)):
-            yield self.frame(index)
+        """Return the frames in order."""
+        return map(self.frame, range(len(self)))
 
     def visible(self, index: int) -> np.ndarray | None:
         """Where keypoints may lie in frame `index`, (height, width) uint8: 255, elsewhere 0.
@@ -355,15 +352,9 @@ def read_intrinsics(path: str | Path, camera: str = "image_0") -> np.ndarray:
     camera, of P_rect_00 to P_rect_03. Raises InputError if the line is missing, or if the camera
     has distortion or skew.
     """
-    key = CALIBRATION_KEYS.get(camera, "P0")
-    form = f"must hold a line '{key}: f 0 u 0 0 f v 0 0 0 1 0' of a camera without distortion"
-    try:
-        lines = [line for line in read_text(path).splitlines() if line.startswith(f"{key}:")]
-        matrix = np.array(lines[0].split()[1:], np.float64).reshape(3, 4)[:, :3]
-    except InputError as error:
-        raise InputError(f"{error}; it {form}") from None
-    except (ValueError, IndexError):
-        matrix = np.zeros((3, 3))
+    form = ", f 0 u 0 0 f v 0 0 0 1 0, of a camera without distortion"
+    key = f"{CALIBRATION_KEYS.get(camera, 'P0')}:"
+    matrix = read_line(path, key, 12, form).reshape(3, 4)[:, :3]
     if not is_camera_matrix(matrix):
-        raise InputError(f"{path}: {form}")
+        raise InputError(f"{path}: line '{key}' must hold 12 numbers{form}")
     return matrix

@@ -7,6 +7,7 @@ Cityscapes' train ids ("train") and colours ("colors").
 
 import csv
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -17,6 +18,15 @@ from thesis_repro.running.files import read_color, read_ids
 from thesis_repro.running.results import digest_of_file
 
 LABEL_IDS, TRAIN_IDS, COLORS = "labels", "train", "colors"
+# {name: see `read_table`}; of labels with one colour, the first one is meant: "car" before "license
+# plate"
+TABLES: dict[Any, tuple[bool, dict[int, int]]] = {
+    TRAIN_IDS: (
+        False,
+        {255: ID["unlabeled"]} | {number: ID[name] for number, name in enumerate(TRAINED)},
+    ),
+    COLORS: (True, {int.from_bytes(label.color): label.id for label in reversed(LABELS)}),
+}
 NOT_NAMED = 255  # no label id
 RGB = np.array([1 << 16, 1 << 8, 1])  # makes one number of a colour
 
@@ -26,12 +36,8 @@ def read_table(path: str | Path) -> tuple[bool, dict[int, int]]:
 
     Raises InputError, naming the line, for a line that is not an id or a colour and a label.
     """
-    if path == TRAIN_IDS:
-        table = {number: ID[name] for number, name in enumerate(TRAINED)}
-        return False, table | {255: ID["unlabeled"]}
-    if path == COLORS:
-        # of labels with one colour, the first one is meant: "car" before "license plate"
-        return True, {int.from_bytes(label.color): label.id for label in reversed(LABELS)}
+    if path in TABLES:
+        return TABLES[path]
     lines = read_text(path).split("\n")
     table = {}
     for number, row in enumerate(csv.reader(lines), 1):
@@ -51,7 +57,7 @@ def read_table(path: str | Path) -> tuple[bool, dict[int, int]]:
 
 def record(ids: str | Path) -> dict[str, str]:
     """Return what the record of results has of a table in a file: its digest."""
-    if ids in (LABEL_IDS, TRAIN_IDS, COLORS):
+    if ids in (LABEL_IDS, *TABLES):
         return {}
     return {"table": digest_of_file(ids)}
 

@@ -73,9 +73,11 @@ def frames_in(folder: Path) -> list[Path]:
 
     Names such as 0.15 and 0.2, which differ in their number of decimals, are decimal numbers, or
     seconds and nanoseconds without leading zeros. Raises InputError if they may be both, in
-    different orders.
+    different orders, and if there are no images.
     """
     paths = images(folder)
+    if not paths:
+        raise InputError(f"{folder}: holds no PNG or JPEG images")
     parts = [path.stem.split(".") for path in paths if DECIMAL.fullmatch(path.stem)]
     fractions = [fraction for _, fraction in parts]
     if len(parts) < len(paths) or len(set(map(len, fractions))) < 2:

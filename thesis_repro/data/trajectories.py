@@ -20,6 +20,24 @@ def read_text(path: str | Path) -> str:
         raise InputError(f"{path}: cannot be read: {reason}") from None
 
 
+def read_line(path: str | Path, key: str, count: int, form: str = "") -> np.ndarray:
+    """Numbers, (count,), of a file's first line that begins with a key, such as "P0:".
+
+    form: what is said of them beside. Raises InputError unless they are `count` finite numbers.
+    """
+    wanted = f"must hold a line '{key}' of {count} finite numbers{form}"
+    try:
+        lines = [line for line in read_text(path).splitlines() if line.startswith(key)]
+        numbers = np.array(lines[0].removeprefix(key).split(), np.float64)
+    except InputError as error:
+        raise InputError(f"{error}; it {wanted}") from None
+    except (ValueError, IndexError):
+        numbers = np.empty(0)
+    if len(numbers) != count or not np.isfinite(numbers).all():
+        raise InputError(f"{path}: {wanted}")
+    return numbers
+
+
 def _read_numbers(path: str | Path, *columns: int) -> tuple[np.ndarray, list[int]]:
     """Return the numbers of a file, (n, columns), and the number of the line of each row.
 

@@ -148,9 +148,9 @@ def keypoint_mask(
     if settings.movable is not None:
         mask[near_movable(label_map, size, settings.movable)] = 0
     if settings.margin:
-        inside = mask[settings.margin : -settings.margin, settings.margin : -settings.margin].copy()
-        mask[:] = 0
-        mask[settings.margin : -settings.margin, settings.margin : -settings.margin] = inside
+        first, last = slice(settings.margin), slice(-settings.margin, None)
+        mask[first] = mask[last] = 0
+        mask[:, first] = mask[:, last] = 0
     return mask
 
 

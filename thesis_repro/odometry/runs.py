@@ -73,12 +73,9 @@ def start_pose(sequence: Sequence) -> np.ndarray:
     It is the identity, as in PySLAM, unless the ground truth starts at another pose. Complete KITTI
     sequences start at the identity (up to 1e-10); excerpts do not.
     """
-    if not sequence.has_truth:
-        return np.eye(4)
-    first = sequence.poses[0]
-    if np.abs(first - np.eye(4)).max() < 1e-6:
-        return np.eye(4)
-    return first
+    if sequence.has_truth and np.abs(sequence.poses[0] - np.eye(4)).max() >= 1e-6:
+        return sequence.poses[0]
+    return np.eye(4)
 
 
 def scales(sequence: Sequence) -> np.ndarray:
@@ -88,10 +85,8 @@ def scales(sequence: Sequence) -> np.ndarray:
     """
     if not sequence.has_truth:
         return sequence.assumed_steps
-    lengths = np.zeros(len(sequence.poses))
-    for index, step in enumerate(np.diff(sequence.poses[:, :3, 3], axis=0)):
-        lengths[index + 1] = np.linalg.norm(step)
-    return lengths
+    steps = np.diff(sequence.poses[:, :3, 3], axis=0)
+    return np.array([0.0, *map(np.linalg.norm, steps)])
 
 
 def run(
@@ -115,8 +110,9 @@ def run(
     step_lengths = scales(sequence)
     rows = []
     for index in progress(range(len(sequence)), description):
-        ((mask, mask_seconds),) = _masks_of_frame(sequence, index, [masks]).values()
-        step = odometry.step(sequence.frame(index), step_lengths[index], mask)
+        frame = sequence.frame(index)
+        mask, mask_seconds = _masks_of_frame(sequence, index, [masks])[id(masks)]
+        step = odometry.step(frame, step_lengths[index], mask)
         rows.append([*step.row().values(), mask_seconds])
     return _result(rows, settings)
 
@@ -179,7 +175,8 @@ def _masks_of_frame(
         if id(masks) not in made:
             started = time.perf_counter()
             mask = None if masks is None else masks[index]
-            made[id(masks)] = inside(visible, mask), time.perf_counter() - started
+            seconds = time.perf_counter() - started
+            made[id(masks)] = inside(visible, mask), seconds
     return made
 
 

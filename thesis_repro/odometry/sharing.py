@@ -36,10 +36,10 @@ class SharedCalls:
         self.calls = Calls(
             self.detect, self.track, self.find_essential_matrix, opencv_exact.recover_pose
         )
-        self._frame: np.ndarray | None = None
-        self._forget()
+        self._start(None)
 
-    def _forget(self) -> None:
+    def _start(self, frame: np.ndarray | None) -> None:
+        self._frame = frame
         self._tracks: _Tracks | None = None
         self._detected: dict[tuple, tuple] = {}
         self._tracked: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
@@ -48,15 +48,11 @@ class SharedCalls:
     def expect(self, frame: np.ndarray, runs: Iterable[Odometry]) -> None:
         """Forget the frame before, and track the points of all runs into this one."""
         self._turn_to(frame)
-        previous = None
-        points_of_runs = {}
-        for run in runs:
-            if len(run.points):
-                previous = run.previous  # the same for all runs
-                points_of_runs[run.points.tobytes()] = run.points
-        if previous is None:
+        followed = {run.points.tobytes(): run for run in runs if len(run.points)}
+        if not followed:
             return
-        keys = np.unique(np.concatenate([_keys(points) for points in points_of_runs.values()]))
+        previous = next(iter(followed.values())).previous  # the same for all runs
+        keys = np.unique(np.concatenate([_keys(run.points) for run in followed.values()]))
         points = keys.view(np.float32).reshape(-1, 2)
         self._tracks = _Tracks(previous, keys, *track(previous, frame, points))
 
@@ -104,8 +100,7 @@ class SharedCalls:
 
     def _turn_to(self, frame: np.ndarray) -> None:
         if frame is not self._frame:
-            self._frame = frame
-            self._forget()
+            self._start(frame)
 
 
 def _keys(points: np.ndarray) -> np.ndarray:
