@@ -4,7 +4,7 @@ The results equal those of separate runs with OpenCV's calls, to the bit.
 """
 
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -51,7 +51,7 @@ class SharedCalls:
         followed = {run.points.tobytes(): run for run in runs if len(run.points)}
         if not followed:
             return
-        previous = next(iter(followed.values())).previous  # the same for all runs
+        previous: Any = next(iter(followed.values())).previous  # the same for all runs
         keys = np.unique(np.concatenate([_keys(run.points) for run in followed.values()]))
         points = keys.view(np.float32).reshape(-1, 2)
         self._tracks = _Tracks(previous, keys, *track(previous, frame, points))
