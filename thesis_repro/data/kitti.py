@@ -227,8 +227,8 @@ class Sequence:
     @cached_property
     def size(self) -> tuple[int, int]:
         """Size (height, width) of the first frame. Raises InputError as `check_camera` does."""
-        size = self._read(self.frame_paths[0]).shape
         first = self.frame_paths[0]
+        size = read_gray(first, np.uint16).shape
         check_camera(self.calibration_path, self.intrinsics, first, size, self.stated_size)
         return size
 
@@ -237,14 +237,13 @@ class Sequence:
 
         Raises InputError if it is unreadable or has another size.
         """
-        image = self._read(self.frame_paths[index])
-        check_size(self.frame_paths[index], image.shape, self.size)
+        path = self.frame_paths[index]
+        if self._white:
+            image = cv2.convertScaleAbs(read_gray(path, np.uint16), alpha=255 / self._white)
+        else:
+            image = read_gray(path)
+        check_size(path, image.shape, self.size)
         return self.undistorted(image)
-
-    def _read(self, path: Path) -> np.ndarray:
-        if not self._white:
-            return read_gray(path)
-        return cv2.convertScaleAbs(read_gray(path, np.uint16), alpha=255 / self._white)
 
     @cached_property
     def _white(self) -> int:
