@@ -12,7 +12,7 @@ import numpy as np
 from thesis_repro.data import label_ids
 from thesis_repro.data.kitti import Sequence, check_size
 from thesis_repro.errors import InputError
-from thesis_repro.masks import THESIS_MASKS, MaskSettings, check, forget, keypoint_mask
+from thesis_repro.masks import THESIS_MASKS, MaskSettings, check_width, forget, keypoint_mask
 from thesis_repro.running import results
 from thesis_repro.running.files import listed, progress, read_gray, write_png
 
@@ -40,7 +40,8 @@ class LabelMasks:
         self.size = sequence.size
         self.dilation_width = dilation_width
         self.settings = settings
-        check(dilation_width, self.size, settings)
+        if settings.has_width:
+            check_width(dilation_width, self.size)
 
     def __len__(self) -> int:
         return len(self.paths)
