@@ -28,7 +28,7 @@ from thesis_repro import mask_files, masks, odometry
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.odometry import THESIS, Odometry, loop
 from thesis_repro.odometry.estimators import refined
-from thesis_repro.running import messages
+from thesis_repro.running import program
 from thesis_repro.running.files import write_text
 from thesis_repro.running.settings import ROOT
 from thesis_repro.segmentation import prediction
@@ -199,4 +199,4 @@ def main():
 
 
 if __name__ == "__main__":
-    messages.run_main(main)
+    program.run_main(main)

@@ -23,7 +23,7 @@ from thesis_repro.masks import MaskSettings
 from thesis_repro.odometry import THESIS, OdometrySettings, estimators, keypoints, metrics
 from thesis_repro.odometry.loop import detect, normalise, track
 from thesis_repro.odometry.runs import Masks
-from thesis_repro.running import results
+from thesis_repro.running import provenance
 from thesis_repro.study.jobs import CONTROL_WIDTH, Job
 from thesis_repro.study.runner import Run, run_all, run_poses
 
@@ -141,9 +141,11 @@ def measure(
         runs |= runs_of(sequence, maps, repetitions, dilation_width)
         made_from[sequence.name] = {
             "dilation_width": dilation_width,
-            "ablations": results.digest_of_file(__file__),
-            "labels": results.digest_of_files([maps / path.name for path in sequence.frame_paths]),
-            "model": results.made_from(maps),
+            "ablations": provenance.digest_of_file(__file__),
+            "labels": provenance.digest_of_files(
+                [maps / path.name for path in sequence.frame_paths]
+            ),
+            "model": provenance.made_from(maps),
         }
     table = run_all(runs, folder, made_from=made_from, processes=processes).table
     poses = run_poses(table, folder)

@@ -38,7 +38,7 @@ from thesis_repro.mask_files import LabelMasks
 from thesis_repro.odometry import THESIS
 from thesis_repro.odometry.keypoints import filled, spread
 from thesis_repro.report import style, texts
-from thesis_repro.running import results
+from thesis_repro.running import provenance
 from thesis_repro.study import compare, jobs
 from thesis_repro.study.jobs import CONTROL_WIDTH, Job
 from thesis_repro.study.runner import Run, run_all
@@ -107,8 +107,8 @@ def measure(
     for sequence in sequences:
         maps = labels / sequence.name
         made_from[sequence.name] = {
-            "choices": results.digest_of_file(__file__),
-            "labels": results.digest_of_files(sorted(maps.glob("*.png"))),
+            "choices": provenance.digest_of_file(__file__),
+            "labels": provenance.digest_of_files(sorted(maps.glob("*.png"))),
         }
         for (choice, number), (settings, masks) in choices(sequence, labels).items():
             for estimator, seed in product(ESTIMATORS, seeds):
@@ -155,7 +155,7 @@ def time_steps(sequence: Sequence, labels: Path, folder: Path, frames: int = 40)
         for (choice, number), least in ((key, min(runs)) for key, runs in seconds.items())
     ]
     times = pd.DataFrame(rows)
-    results.write_table(file, times)
+    provenance.write_table(file, times)
     return times
 
 

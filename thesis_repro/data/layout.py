@@ -8,7 +8,7 @@ from pathlib import Path
 
 from thesis_repro.data import kitti_raw
 from thesis_repro.errors import InputError
-from thesis_repro.running import messages
+from thesis_repro.running import program
 from thesis_repro.running.files import images
 
 # left gray, left colour, then the right ones
@@ -121,7 +121,7 @@ def _may_be_nanoseconds(ordered: list[Path], fractions: list[str]) -> bool:
 @cache
 def say_once(line: str) -> None:
     """Print a line for people, unless this process has printed it."""
-    messages.log.info(line)
+    program.log.info(line)
 
 
 def locate(root: str | Path | None, name: str | Path) -> tuple[Path, Path, Path]:

@@ -16,7 +16,7 @@ from PIL import Image
 from tqdm import tqdm
 
 from thesis_repro.errors import InputError
-from thesis_repro.running import messages
+from thesis_repro.running import program
 
 # matches the names that `temporary_path` returns
 TEMPORARY = re.compile(r"\..*\.thesis-repro-[0-9a-f]{8}(\..*)?")
@@ -163,7 +163,7 @@ def needed(path: str | Path, notebook: str) -> Path:
 def _unstopped(items: Iterable) -> Iterator[Any]:
     """Yield items for steps that a signal to stop does not break."""
     for item in items:
-        with messages.unstopped():
+        with program.unstopped():
             yield item
 
 
