@@ -78,26 +78,6 @@ def gradients(enlarged: np.ndarray, strength: np.ndarray, edge_image: np.ndarray
     return figure
 
 
-def mask_and_keypoints(
-    frame: np.ndarray, edge_image: np.ndarray, mask: np.ndarray, keypoints: np.ndarray, title: str
-) -> plt.Figure:
-    """Draw the edges, the mask and the keypoints (n, 2) of a frame. title: of the edges."""
-    kept = f"{len(keypoints)} keypoints on the mask"
-    panels = {
-        f"{title}, drawn wider": dilate(edge_image, 5),
-        f"mask: {100 * (mask > 0).mean():.1f} % of the frame": mask,
-        kept: frame,
-    }
-    return pictures(frame, panels, {kept: keypoints})
-
-
-def corners(frame: np.ndarray, strength: np.ndarray, points: np.ndarray, title: str) -> plt.Figure:
-    """Draw the strength of a corner at each pixel (h, w), and the keypoints (n, 2)."""
-    logarithm = np.log(strength + strength.max() / 1e4)
-    panels = {"R of every pixel (logarithm)": logarithm, title: frame}
-    return pictures(frame, panels, {title: points})
-
-
 def tracks(
     frame: np.ndarray,
     old: np.ndarray,

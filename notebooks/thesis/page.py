@@ -18,9 +18,10 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
+import pandas as pd
 from markupsafe import Markup
 
-from thesis import captions, section_4_2, tables
+from thesis import captions, timing
 from thesis_repro.report import page, texts
 from thesis_repro.running import messages, results
 from thesis_repro.running.files import atomic, listed, write_text
@@ -255,7 +256,7 @@ def beside_the_thesis(settings: Settings) -> dict[str, Any]:
     Their form is {name of the artefact: numbers}. A name is missing if its file was not written.
     """
     numbers: dict[str, Any] = {}
-    history = tables.read(settings.figures / "figure_4_01.csv")
+    history = _table(settings.figures / "figure_4_01.csv")
     if len(history):
         best = history.loc[history["val_loss"].idxmin()]
         last = history.iloc[-1]
@@ -264,13 +265,18 @@ def beside_the_thesis(settings: Settings) -> dict[str, Any]:
             "best": best.to_dict(),
             "last": last.to_dict(),
         }
-    chosen = tables.read(settings.figures / "table_4_1.csv")
+    chosen = _table(settings.figures / "table_4_1.csv")
     if "mean keypoints" in chosen:
         numbers["figure_4_07"] = {"keypoints": chosen["mean keypoints"].clip(lower=1)}
-    seconds = tables.read(settings.figures / "timings" / "seconds.csv")
+    seconds = _table(settings.figures / "timings" / "seconds.csv")
     if len(seconds):
-        numbers["figure_4_17"] = {"saved": 0 - section_4_2.time_savings(seconds)}
+        numbers["figure_4_17"] = {"saved": 0 - timing.time_savings(seconds)}
     return numbers
+
+
+def _table(path: Path) -> pd.DataFrame:
+    """Return a CSV file as a table; an empty one if there is no such file."""
+    return pd.read_csv(path).convert_dtypes() if path.is_file() else pd.DataFrame()
 
 
 def main() -> None:

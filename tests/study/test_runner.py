@@ -207,16 +207,15 @@ def test_a_slow_stage_shows_in_its_row(sequence, model, monkeypatch):
     monkeypatch.setattr(
         masks, "keypoint_mask", lambda *given: (keypoint_mask(*given), time.sleep(0.5))[0]
     )
-    table = timing.measure(sequence, model, width=5)
+    table = timing.time_stages(sequence, model, width=5)
     assert (
         list(table.columns) == ["method", "stage", "milliseconds"]
         and (table["milliseconds"] > 0).all()
     )
     stages_of = table.groupby("method")["stage"].agg(list)
-    assert stages_of["masked, width 5"] == list(timing.STAGES)
-    assert stages_of["all keypoints"] == [
-        stage for stage in timing.STAGES if stage not in ("segmentation", "mask")
-    ]
+    steps = ["detection", "tracking", "pose"]
+    assert stages_of["masked, width 5"] == ["read", "segmentation", "mask", *steps]
+    assert stages_of["all keypoints"] == ["read", *steps]
     slow = table.set_index(["method", "stage"])["milliseconds"]
     assert slow["masked, width 5", "mask"] > 500 > slow.drop(("masked, width 5", "mask")).max()
 
