@@ -106,10 +106,7 @@ def half_in_turns(sequence: Sequence, into: bool, index: int) -> np.ndarray:
     if metrics.angles(motion) > metrics.TURN_RATE:
         middle = sequence.size[1] // 2
         turns_right = motion[0, 2] > 0  # the optical axis moves to the right
-        if turns_right == into:
-            mask[:, :middle] = 0
-        else:
-            mask[:, middle:] = 0
+        mask[np.s_[:, :middle] if turns_right == into else np.s_[:, middle:]] = 0
     return mask
 
 
@@ -159,9 +156,15 @@ def measure(
     Columns: sequence, method, estimator, repetition, those of `runner.measures`, and sim3 (RMSE in
     metres after an alignment with scale).
     """
-    choices = partial(ablations, labels)
     table = run_choices(
-        choices, sequences, labels, folder, __file__, ESTIMATORS, repetitions, processes
+        lambda sequence: choices(sequence, labels),
+        sequences,
+        labels,
+        folder,
+        __file__,
+        ESTIMATORS,
+        repetitions,
+        processes,
     )
     poses = run_poses(table, folder)
     true = {sequence.name: sequence.poses for sequence in sequences}
@@ -170,7 +173,7 @@ def measure(
     return table
 
 
-def ablations(labels: Path, sequence: Sequence) -> dict[str, Choice]:
+def choices(sequence: Sequence, labels: Path) -> dict[str, Choice]:
     """Return the ablations over one sequence: {method: (settings, masks)}.
 
     labels: a folder with one folder of label maps a sequence.
@@ -309,10 +312,9 @@ def boundaries(label_map: np.ndarray, size: tuple[int, int]) -> dict[str, float]
         ids = [ID[name] for name in pair]
         pair_boundary = exact & np.isin(nearest, ids) & np.isin(neighbour, ids)
         shares["/".join(pair)] = _percent(missed, pair_boundary, least=20)
-    smooth = cv2.GaussianBlur(bilinear, (5, 5), 0)
     for name, other in (
         ("L2", cv2.Canny(bilinear, *masks.CANNY, L2gradient=True)),
-        ("Gaussian", cv2.Canny(smooth, *masks.CANNY)),
+        ("Gaussian", cv2.Canny(cv2.GaussianBlur(bilinear, (5, 5), 0), *masks.CANNY)),
     ):
         shares[name] = 100 * (edges != other).sum() / max(np.count_nonzero(edges | other), 1)
     return shares

@@ -1,8 +1,9 @@
 """The audit: where the thesis contradicts itself, its code or its libraries, and what that does.
 
-audit.json holds the rows. A measurement is one line of a row's numbers: notebook 09, `audit_rows`
-and `audit_run` make them, and `table` joins them to the rows. Ratios come from `study.compare`.
-Intervals of other means are those of Student's t over `n` values: sequences unless said otherwise.
+audit.json holds the rows. A measurement is one line of a row's numbers: notebook 09,
+`audit_of_tables` and `audit_of_data` make them, and `table` joins them to the rows. Ratios come
+from `study.compare`. Intervals of other means are those of Student's t over `n` values: sequences
+unless said otherwise.
 """
 
 import json

@@ -145,8 +145,16 @@ def figure_2_08(poses: np.ndarray, title: str) -> plt.Figure:
     positions, right, ahead = (poses[:, [0, 2], column] for column in (3, 0, 2))
     figure, axes = style.new_figure(height=3.8)
     axes.plot(*positions.T, "o", markersize=4, color="black")
-    arrows: dict[str, Any] = {"angles": "xy", "units": "height", "scale": 11, "width": 0.01}
-    axes.quiver(*positions.T, *ahead.T, color=BLUE, zorder=3, **arrows)
+    axes.quiver(
+        *positions.T,
+        *ahead.T,
+        color=BLUE,
+        zorder=3,
+        angles="xy",
+        units="height",
+        scale=11,
+        width=0.01,
+    )
     for index, position in enumerate(positions):
         axes.annotate(f"$C_{{{index}}}$", position, 16 * right[index], **FORMULA)
     motions = np.linalg.inv(poses[:-1]) @ poses[1:]  # Equation 2.3, for T
@@ -157,8 +165,7 @@ def figure_2_08(poses: np.ndarray, title: str) -> plt.Figure:
         left = (end - start)[::-1] * (-1, 1)
         beside, offset = (start + end) / 2 + 0.15 * left, 11 * left / max(length, 1e-9)
         axes.annotate(formula, beside, offset, color=RED, **FORMULA)
-        label = f"{formula}: {length:.1f} m, {metrics.angles(motion):.1f}°"
-        axes.plot([], [], " ", label=label)
+        axes.plot([], [], " ", label=f"{formula}: {length:.1f} m, {metrics.angles(motion):.1f}°")
     # a square around the path, with room for the formulas
     x, z = (positions.max(axis=0) + positions.min(axis=0)) / 2
     room = 0.65 * max(np.ptp(positions, axis=0).max(), 1)
@@ -166,8 +173,13 @@ def figure_2_08(poses: np.ndarray, title: str) -> plt.Figure:
     axes.set(
         xlabel="x, to the right of the first camera (m)", ylabel="z, ahead of the first camera (m)"
     )
-    place: dict[str, Any] = {"loc": "center left", "bbox_to_anchor": (1, 0.5)}
-    legend = axes.legend(title="motion: length, turn", handlelength=0, handletextpad=0, **place)
+    legend = axes.legend(
+        title="motion: length, turn",
+        loc="center left",
+        bbox_to_anchor=(1, 0.5),
+        handlelength=0,
+        handletextpad=0,
+    )
     legend.get_title().set_fontsize(8)
     # rc_context would also reset whether notebooks show figures
     plt.setp(legend.get_texts(), parse_math=True)
@@ -208,8 +220,15 @@ def figure_2_09(first: np.ndarray, second: np.ndarray, title: str) -> plt.Figure
     ]
     distances = [match.distance for match in best]
     lines = axes.add_collection(LineCollection(ends, array=distances, cmap="plasma", linewidth=0.8))
-    scale: dict[str, Any] = {"location": "bottom", "shrink": 0.5, "aspect": 40, "pad": 0.02}
-    figure.colorbar(lines, ax=axes, label="descriptor bits that differ, of 256", **scale)
+    figure.colorbar(
+        lines,
+        ax=axes,
+        location="bottom",
+        shrink=0.5,
+        aspect=40,
+        pad=0.02,
+        label="descriptor bits that differ, of 256",
+    )
     return figure
 
 

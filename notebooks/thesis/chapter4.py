@@ -1,4 +1,4 @@
-"""Figures 4.3 to 4.16: single frames, errors in metres, and keypoints.
+"""Figures 4.4 to 4.16: single frames, paths, and errors in metres.
 
 `thesis_repro.report.comparison` shows ratios of errors.
 
@@ -7,7 +7,7 @@ the only run. Bands and error bars go from the lowest to the highest repetition.
 """
 
 from functools import partial
-from itertools import compress, product
+from itertools import compress
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -19,7 +19,6 @@ from matplotlib.patches import Patch
 
 from thesis import frames
 from thesis.flicker import View
-from thesis_repro.odometry.keypoints import spread
 from thesis_repro.report import style
 from thesis_repro.report.style import (
     BASELINE,
@@ -54,20 +53,6 @@ FAILED: dict[str, Any] = {
 }
 
 
-def figure_4_03(
-    frame: np.ndarray, prediction: np.ndarray, title: str, label_map: np.ndarray | None = None
-) -> plt.Figure:
-    """Figure 4.3: a KITTI frame and its predicted label map at the network's size.
-
-    If the true label map is known, it stands below.
-    """
-    label_maps = {"prediction": prediction}
-    if label_map is not None:
-        label_maps["true label map"] = label_map
-    colored = {name: style.label_colors(ids, frame) for name, ids in label_maps.items()}
-    return frames.pictures(frame, {title: frame, **colored}, label_maps=label_maps.values())
-
-
 def figure_4_04(
     frame: np.ndarray, edge_image: np.ndarray, keypoints: np.ndarray, title: str
 ) -> plt.Figure:
@@ -77,60 +62,6 @@ def figure_4_04(
     brighter = np.clip(230 * (frame / bright) ** 0.6, 0, 255).astype(np.uint8)
     style.show_image(axes, frames.with_edges(brighter, edge_image), title)
     axes.scatter(*keypoints.T, s=9, color=KEYPOINT["color"], edgecolors="black", linewidths=0.4)
-    return figure
-
-
-def figure_4_05(
-    frame: np.ndarray,
-    all_keypoints: np.ndarray,
-    prediction: np.ndarray,
-    mask: np.ndarray,
-    kept_keypoints: np.ndarray,
-    dilation_width: int,
-    title: str,
-) -> plt.Figure:
-    """Figure 4.5: the procedure in five panels.
-
-    They are the frame, all keypoints, the prediction, its dilated edges and the kept keypoints.
-    """
-    all_title = f"(b) all {len(all_keypoints)} Shi-Tomasi keypoints"
-    kept_title = f"(e) the {len(kept_keypoints)} keypoints that the mask keeps"
-    pictures = {
-        f"(a) {title}": frame,
-        all_title: frame,
-        "(c) prediction": style.label_colors(prediction, frame),
-        f"(d) Canny edges dilated by {dilation_width}x{dilation_width}": mask,
-        kept_title: frame,
-    }
-    keypoints = {all_title: all_keypoints, kept_title: kept_keypoints}
-    return frames.pictures(frame, pictures, keypoints, label_maps=[prediction])
-
-
-def figure_overview(
-    frame: np.ndarray,
-    all_keypoints: np.ndarray,
-    mask: np.ndarray,
-    kept_keypoints: np.ndarray,
-    title: str,
-) -> plt.Figure:
-    """Draw all keypoints of a frame, those on its mask, and 200 that are spread over the frame.
-
-    Keypoints are (n, 2) pixels. title: of the frame.
-    """
-    few = spread(200)(frame)
-    panels = {
-        f"{title}: all {len(all_keypoints)} keypoints": (frame, all_keypoints),
-        f"{len(kept_keypoints)} on the mask (light)": (
-            np.where(mask > 0, frame, frame // 3),
-            kept_keypoints,
-        ),
-        f"{len(few)} spread over the frame": (frame, few),
-    }
-    figure = frames.pictures(frame, {text: picture for text, (picture, _) in panels.items()})
-    for panel, (_, points) in zip(figure.axes, panels.values(), strict=True):
-        # two thousand dots must not merge, and two hundred must be seen
-        size = np.clip(2000 / len(points), 1.2, 8)
-        panel.scatter(*points.T, **{**KEYPOINT, "s": size})
     return figure
 
 
@@ -221,8 +152,7 @@ def figure_paths(
         above.set_ylabel("z (m) over x (m)", fontsize=7.5)
         below.set_ylabel("distance (m)", fontsize=7.5)
     style.legend_below(figure, [above for above, _ in pairs[: len(groups)]], 4)
-    of_repetitions = ", mean (lowest-highest of the repetitions)"
-    repeated = of_repetitions if rows["repetition"].any() else ""
+    repeated = ", mean (lowest-highest of the repetitions)" if rows["repetition"].any() else ""
     figure.suptitle(f"RMSE of each sequence{repeated}", fontsize=9)
     return figure
 
@@ -286,42 +216,44 @@ def figure_against_width(masked: pd.DataFrame, baseline: pd.DataFrame, metric: s
     crosses = errors["mean"][failed.any()]
     for (_, width), error in crosses.items():
         axes.plot(width, error, **FAILED)
-    title = f"{metric.upper()} against dilation width, by sequence"
-    axes.set(xlabel="dilation width (pixels)", ylabel=label, title=title)
+    axes.set(
+        xlabel="dilation width (pixels)",
+        ylabel=label,
+        title=f"{metric.upper()} against dilation width, by sequence",
+    )
     of_all = compare.spread(baseline, metric)
     _, panels = frames.small_panels(names, "width (pixels)", below)
     for panel, name in zip(panels, names, strict=True):
         bars, band = errors.loc[name], of_all.loc[name]
-        low, high = bars["lowest"], bars["highest"]
-        look: dict[str, Any] = {"color": MASKED, "alpha": 0.35, "linewidth": 4}
-        panel.vlines(bars.index, low, high, label=f"masked, {BAND}", **look)
-        look = {"color": MASKED, "marker": "o", "markersize": 2, "linewidth": 1.1}
-        panel.plot(bars["mean"], label="masked, mean", **look)
+        panel.vlines(
+            bars.index,
+            bars["lowest"],
+            bars["highest"],
+            color=MASKED,
+            alpha=0.35,
+            linewidth=4,
+            label=f"masked, {BAND}",
+        )
+        panel.plot(
+            bars["mean"], "o-", color=MASKED, markersize=2, linewidth=1.1, label="masked, mean"
+        )
         if name in crosses:
             panel.plot(crosses[name], **FAILED)
-        look = {"color": BASELINE, "alpha": 0.2, "linewidth": 0}
-        panel.axhspan(band["lowest"], band["highest"], label=f"all keypoints, {BAND}", **look)
-        look = {"color": BASELINE, "linestyle": "--", "linewidth": 1.1}
-        panel.axhline(band["mean"], label="all keypoints, mean", **look)
+        panel.axhspan(
+            band["lowest"],
+            band["highest"],
+            color=BASELINE,
+            alpha=0.2,
+            linewidth=0,
+            label=f"all keypoints, {BAND}",
+        )
+        panel.axhline(
+            band["mean"], color=BASELINE, linestyle="--", linewidth=1.1, label="all keypoints, mean"
+        )
         panel.set_ylim(0, None)
     below.supylabel(label, fontsize=8)
     style.legend_below(below, panels, 2)
     return figure
-
-
-def errors_of_methods(methods: dict[str, pd.DataFrame]) -> pd.DataFrame:
-    """Return the errors of the three METHODS (Figures 4.13 to 4.16), a row a sequence and metric.
-
-    methods: the runs to compare, {one of METHODS: runs}.
-    Columns: metric ("rmse" or "mae"), method (its name in figures), sequence; mean, lowest and
-    highest of the repetitions; failed, whether a run failed.
-    """
-    tables = []
-    for (method, rows), metric in product(methods.items(), ("rmse", "mae")):
-        failed = compare.has_failed(rows).groupby(rows["sequence"]).any()
-        spread = compare.spread(rows, metric).assign(failed=failed).reset_index()
-        tables.append(spread.assign(metric=metric, method=METHODS[method][0]))
-    return pd.concat(tables, ignore_index=True)
 
 
 def mark_failed(axes: plt.Axes, failed: pd.DataFrame) -> None:

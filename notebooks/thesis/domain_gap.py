@@ -61,11 +61,9 @@ def labelled_frames(drives: list[kitti.Sequence]) -> list[cityscapes.Pair]:
         if label_folder.is_dir():
             count = min(len(drive), max(1, IMAGES // len(drives)))
             middles = (np.arange(count) + 0.5) * len(drive) / count  # of equal parts of the drive
-            paths = [drive.frame_paths[index] for index in middles.astype(int)]
-            pairs += [
-                cityscapes.Pair(f"{drive.name}_{path.stem}", path, label_folder / path.name)
-                for path in paths
-            ]
+            for path in (drive.frame_paths[index] for index in middles.astype(int)):
+                name = f"{drive.name}_{path.stem}"
+                pairs.append(cityscapes.Pair(name, path, label_folder / path.name))
     return pairs
 
 

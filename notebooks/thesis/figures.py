@@ -8,7 +8,7 @@ import platform
 import subprocess
 import sys
 
-from thesis import page, trainings
+from thesis import figures_page, trainings
 from thesis_repro.running import messages, results
 from thesis_repro.running.settings import ROOT, Settings, read_settings
 
@@ -27,7 +27,7 @@ def main() -> int:
         )
     with results.claimed(settings.build / "notebooks"):
         status = _execute(settings)
-        page.update(settings, settings.published)
+        figures_page.update(settings, settings.published)
     if note := trainings.network_note(settings):
         print(note)
     return status

@@ -17,10 +17,8 @@ def notes(settings: Settings, runs: pd.DataFrame, mask_settings: dict[str, Any])
 
     mask_settings: those that are not the thesis's.
     """
-    note = settings.data_note
-    if mask_settings:
-        changed = ", ".join(f"{name} {value}" for name, value in mask_settings.items())
-        note += f"; masks: {changed}"
+    changed = ", ".join(f"{name} {value}" for name, value in mask_settings.items())
+    note = f"{settings.data_note}; masks: {changed}" if changed else settings.data_note
     if settings.kitti_is_embedded:
         return note, "thesis, another data set"
     frames = runs.groupby("sequence")["frames"].first()

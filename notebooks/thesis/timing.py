@@ -56,7 +56,7 @@ def time_savings(seconds: pd.DataFrame) -> pd.Series:
     return percent_change(masked.groupby("dilation_width")["seconds"].sum(), baseline)
 
 
-def time_stages(sequence: Sequence, model: Any, width: int = CONTROL_WIDTH) -> pd.DataFrame:
+def measure(sequence: Sequence, model: Any, width: int = CONTROL_WIDTH) -> pd.DataFrame:
     """Time each stage of a frame, with all keypoints and with masks.
 
     Returns a table of method, stage, milliseconds (medians).
@@ -101,7 +101,7 @@ def time_stages(sequence: Sequence, model: Any, width: int = CONTROL_WIDTH) -> p
 def table_budget(measured: pd.DataFrame) -> pd.DataFrame:
     """Return the milliseconds of each stage for one frame, one column a method.
 
-    The last rows have their sum and the frames a second. measured: of `time_stages`.
+    The last rows have their sum and the frames a second. measured: of `measure`.
     """
     table = measured.pivot(index="stage", columns="method", values="milliseconds")
     table = table.loc[measured["stage"].unique(), measured["method"].unique()]

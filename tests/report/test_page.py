@@ -11,7 +11,8 @@ import pandas as pd
 import pytest
 from bs4 import BeautifulSoup
 
-from thesis import captions, page
+from thesis import captions
+from thesis import figures_page as page
 from thesis_repro.report import page as report_page
 from thesis_repro.report import style
 from thesis_repro.running.settings import ROOT, read_settings

@@ -260,8 +260,8 @@ def drawn_by_cells(runs):
     figures = {}
     save = SimpleNamespace(save_figure=lambda figure, name, note: figures.update({name: figure}))
     given = {"runs": runs, "SEQUENCES": sorted(runs["sequence"].unique()), "note": ""}
-    modules = {"np": np, "chapter4": chapter4, "frames": frames, "style": style}
-    modules["section_4_2"] = section_4_2
+    modules = {"np": np, "pd": pd, "chapter4": chapter4, "frames": frames, "style": style}
+    modules |= {"section_4_2": section_4_2, "compare": compare}
     names = given | modules | {"artefacts": save}
     for number in ("58", "54", "18", "55", "56", "26", "27"):
         exec(cells("08_results.ipynb", "code")[f"08-{number}"], names)

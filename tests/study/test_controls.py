@@ -123,7 +123,7 @@ def test_controls_leave_as_many_keypoints_as_masks_of_the_tested_width(
 
 def test_every_ablation_differs_from_its_reference_in_one_thing(small_world, small_labels):
     sequence = Sequence(small_world / "kitti", "00").subset(4)
-    runs = ablations.ablations(small_labels, sequence)
+    runs = ablations.choices(sequence, small_labels)
     settings, thesis_masks = runs["masked"]
     assert settings == THESIS
     expected = mask_files.LabelMasks(small_labels / "00", sequence, 10)
