@@ -54,7 +54,7 @@ setup: .venv/ready $(if $(filter 1,$(GPU)),.venv/ready-gpu)
 figures: setup
 	@$(BIN)/python -m thesis.figures
 page: setup
-	@$(BIN)/python -m thesis.figures_page
+	@$(BIN)/python -m thesis.page
 
 # Which notebook needs what; `thesis.figures` runs this with the folder of the run. A notebook is executed again if one that
 # it needs was, or if the code that it uses has changed. With real frames and no Cityscapes, the shipped model makes the
@@ -63,7 +63,7 @@ ifdef RUN
 code = $(shell find $(1) -name '*.py')
 LEARNING := $(call code,thesis_repro/data thesis_repro/segmentation street_world)
 PATHS := $(call code,thesis_repro/data thesis_repro/masks thesis_repro/mask_files.py thesis_repro/odometry opencv_exact)
-DRAWING := $(filter-out %/page.py %/figures_page.py %/figures.py,$(call code,thesis_repro/study thesis_repro/report notebooks/thesis))
+DRAWING := $(filter-out %/page.py %/figures.py,$(call code,thesis_repro/study thesis_repro/report notebooks/thesis))
 NAMES := $(patsubst notebooks/%.ipynb,%,$(sort $(wildcard notebooks/*.ipynb)))
 NAMES := $(if $(or $(THESIS_REPRO_CITYSCAPES),$(if $(THESIS_REPRO_KITTI),,embedded)),$(NAMES),$(filter-out 01_% 02_% 04_%,$(NAMES)))
 executed = $(patsubst %,$(RUN)/notebooks/%.ipynb,$(filter $(addsuffix _%,$(1)),$(NAMES)))

@@ -103,14 +103,14 @@ def small_labels(small_world, tmp_path_factory):
 
     They are laid out as notebook 5 does.
     """
-    from thesis_repro.running import results
+    from thesis_repro.running import provenance
 
     with _shared_folder(tmp_path_factory, "small_labels") as root:
         if root.exists():
             return root
         for path in small_world.glob("kitti/sequences/*/labels_0/*.png"):
             folder = root / path.parent.parent.name
-            results.stage(folder, model="none")
+            provenance.stage(folder, model="none")
             label_map = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
             resized = cv2.resize(label_map, (320, 320), interpolation=cv2.INTER_NEAREST)
             cv2.imwrite(str(folder / path.name), resized)

@@ -19,7 +19,7 @@ from thesis_repro.data import cityscapes, kitti
 from thesis_repro.errors import InputError, one_line
 from thesis_repro.mask_files import LabelMasks, MaskFolder, label_map_of
 from thesis_repro.masks import coverage
-from thesis_repro.running import files, messages
+from thesis_repro.running import files, program
 from thesis_repro.running.settings import read_settings
 
 # Of the principal point from the middle, in frame widths and heights. KITTI has at most 0.04.
@@ -283,4 +283,4 @@ def _class_shares(source: LabelMasks) -> np.ndarray:
 
 
 if __name__ == "__main__":
-    messages.run_main(lambda: main(Path(sys.argv[1])))
+    program.run_main(lambda: main(Path(sys.argv[1])))

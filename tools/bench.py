@@ -29,7 +29,7 @@ from thesis_repro.data.kitti import Sequence
 from thesis_repro.odometry import THESIS, Odometry
 from thesis_repro.odometry import odometry as page
 from thesis_repro.odometry.estimators import refined
-from thesis_repro.running import messages
+from thesis_repro.running import program
 from thesis_repro.running.files import write_text
 from thesis_repro.running.settings import ROOT
 from thesis_repro.segmentation import prediction
@@ -200,4 +200,4 @@ def main():
 
 
 if __name__ == "__main__":
-    messages.run_main(main)
+    program.run_main(main)

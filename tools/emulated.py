@@ -16,7 +16,7 @@ from pathlib import Path
 
 from thesis_repro import segmentation
 from thesis_repro.errors import InputError
-from thesis_repro.running import messages
+from thesis_repro.running import program
 
 
 def digest() -> str:
@@ -62,4 +62,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    messages.run_main(main)
+    program.run_main(main)

@@ -23,7 +23,7 @@ from thesis_repro.data.cityscapes import ID, read_label_map
 from thesis_repro.errors import InputError
 from thesis_repro.odometry import odometry
 from thesis_repro.report import style, texts
-from thesis_repro.running import messages
+from thesis_repro.running import program
 from thesis_repro.running.settings import ROOT, cores
 from thesis_repro.study import compare, jobs, runner
 from thesis_repro.study.sources import Source
@@ -126,4 +126,4 @@ def main():
 
 
 if __name__ == "__main__":
-    messages.run_main(main)
+    program.run_main(main)

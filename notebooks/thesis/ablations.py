@@ -22,7 +22,7 @@ from thesis_repro.mask_files import LabelMasks
 from thesis_repro.masks import MaskSettings
 from thesis_repro.odometry import THESIS, estimators, keypoints, metrics
 from thesis_repro.odometry.odometry import detect, normalise, track
-from thesis_repro.running import results
+from thesis_repro.running import provenance
 from thesis_repro.study.jobs import CONTROL_WIDTH, Job
 from thesis_repro.study.methods import Choice
 from thesis_repro.study.runner import Run, run_all, run_poses
@@ -136,8 +136,8 @@ def run_choices(
     for sequence in sequences:
         maps = [labels / sequence.name / path.name for path in sequence.frame_paths]
         made_from[sequence.name] = {
-            "choices": results.digest_of_file(code),
-            "labels": results.digest_of_files(maps),
+            "choices": provenance.digest_of_file(code),
+            "labels": provenance.digest_of_files(maps),
         }
         for (method, (settings, given)), estimator, repetition in product(
             choices(sequence).items(), estimators, range(repetitions)

@@ -37,7 +37,7 @@ from thesis_repro.mask_files import LabelMasks
 from thesis_repro.odometry import THESIS
 from thesis_repro.odometry.keypoints import filled, spread
 from thesis_repro.report import style, texts
-from thesis_repro.running import results
+from thesis_repro.running import provenance
 from thesis_repro.study import compare, jobs
 from thesis_repro.study.jobs import CONTROL_WIDTH
 from thesis_repro.study.worth import FILL
@@ -140,7 +140,7 @@ def time_steps(sequence: Sequence, labels: Path, folder: Path, frames: int = 40)
     # whole milliseconds: repeated measurements differ by more than one
     times = (1000 * pd.Series(least) / len(excerpt)).round().astype(int)
     times = times.rename_axis(["choice", "number"]).rename("milliseconds").reset_index()
-    results.write_table(file, times)
+    provenance.write_table(file, times)
     return times
 
 

@@ -18,7 +18,7 @@ from thesis_repro.command.options import named as named_options
 from thesis_repro.data import cityscapes
 from thesis_repro.data.trajectories import read_poses
 from thesis_repro.masks.kinds import KINDS, Kind
-from thesis_repro.running import results
+from thesis_repro.running import provenance
 from thesis_repro.running.files import write_png
 
 
@@ -167,7 +167,7 @@ def test_label_maps_in_other_ids_give_the_same_masks(tiny_kitti, tmp_path):
         assert run("masks", *where, "--ids", ids, "--output", tmp_path / "masks") == 0
         made.append((tmp_path / "masks/000002.png").read_bytes())
     assert made[0] == made[1] == made[2]
-    assert "table" in results.record(tmp_path / "masks")
+    assert "table" in provenance.record(tmp_path / "masks")
 
 
 def test_a_new_kind_of_mask_is_one_entry(monkeypatch, tiny_kitti, tmp_path):

@@ -10,7 +10,7 @@ from drawn import END
 from making import EXECUTED, FIGURES, make_figures
 from nbclient import NotebookClient
 
-from thesis import figures_page as page
+from thesis import page
 from thesis_repro.running.settings import PREFIX, ROOT, read_settings
 
 pytestmark = pytest.mark.notebooks
@@ -114,7 +114,7 @@ def test_the_page_shows_every_artefact(executed):
         ("thesis_repro/mask_files.py", {"05", "06", "07", "08", "09"}),
         ("street_world/street.py", {name[:2] for name in NOTEBOOKS}),
         ("notebooks/thesis/domain_gap.py", {"05", "06", "07", "08", "09"}),
-        ("notebooks/thesis/figures_page.py", set()),
+        ("notebooks/thesis/page.py", set()),
         ("docs/answer.md", set()),  # nothing is executed twice
     ],
 )

@@ -21,7 +21,7 @@ from thesis import (
 )
 from thesis_repro.data.cityscapes import ID
 from thesis_repro.report import style
-from thesis_repro.running import results
+from thesis_repro.running import provenance
 from thesis_repro.running.settings import ROOT
 from thesis_repro.study import compare
 
@@ -283,7 +283,7 @@ RECORDED = trainings.read()["network"].iloc[0]
 )
 def test_the_networks_are_compared(tmp_path, network, in_git, named):
     if network:
-        results.stage(tmp_path / "labels" / "00", model=network)
+        provenance.stage(tmp_path / "labels" / "00", model=network)
     note = trainings.network_note(SimpleNamespace(build=tmp_path, figures_in_git=in_git))
     assert bool(note) == bool(named) and all(name in note for name in named)
     assert ("XLA_FLAGS" in note) == (len(named) > 1)

@@ -11,10 +11,8 @@ import pandas as pd
 import pytest
 from bs4 import BeautifulSoup
 
-from thesis import captions
-from thesis import figures_page as page
-from thesis_repro.report import page as report_page
-from thesis_repro.report import style
+from thesis import captions, page
+from thesis_repro.report import html, style
 from thesis_repro.running.settings import ROOT, read_settings
 
 SVG = '<svg height="100pt" width="200pt" xmlns="http://www.w3.org/2000/svg"><path d="M0 0"/></svg>'
@@ -61,9 +59,7 @@ def run(tmp_path):
     settings = replace(settings, figures=settings.published)
     settings.figures.mkdir()
     for artefact in ARTEFACTS:
-        for ending in report_page.ENDINGS[artefact["kind"]][
-            : 1 if artefact["kind"] == "figure" else None
-        ]:
+        for ending in html.ENDINGS[artefact["kind"]][: 1 if artefact["kind"] == "figure" else None]:
             text = {".svg": SVG}.get(ending, "What it shows")
             (settings.figures / f"{artefact['name']}{ending}").write_text(text)
         if artefact["kind"] == "table":

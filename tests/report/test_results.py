@@ -1,6 +1,6 @@
 """Figures and tables of chapter 4, the comparison and the findings show the numbers of the runs."""
 
-import html
+from html import escape
 from types import SimpleNamespace
 
 import made_up
@@ -15,8 +15,7 @@ from matplotlib.container import BarContainer
 from thesis import chapter4, few_keypoints, frames, section_4_2
 from thesis.captions import REPORTED
 from thesis_repro.errors import one_line
-from thesis_repro.report import comparison, findings, style, texts
-from thesis_repro.report import study as report_study
+from thesis_repro.report import comparison, findings, html, study_report, style, texts
 from thesis_repro.study import compare
 from thesis_repro.study.jobs import ESTIMATORS
 
@@ -157,7 +156,7 @@ def test_errors_are_means_with_their_spread_and_the_lowest_is_bold():
     bold = table[ELEVEN].map(lambda cell: cell.startswith("**"))
     of_masks = bold[table["method"] == "masks, width 10"]
     assert (bold.sum() == 4).all() and of_masks.to_numpy().mean() > 0.9
-    pieces = report_study.latex_errors(table).split("\\end{tabular}")[:-1]
+    pieces = study_report.latex_errors(table).split("\\end{tabular}")[:-1]
     assert len(pieces) == 12 and all("{lllll}" in piece or "{llll}" in piece for piece in pieces)
     assert sum(piece.count("\\textbf{") for piece in pieces) == 44
     paths = runs[runs["method"] == "baseline"].assign(method="paths", source="slam")
@@ -177,9 +176,9 @@ def test_deviations_of_zero_are_a_note_below_the_table():
     has_deviation = table[ELEVEN[:5]].map(lambda cell: "±" in cell).all(axis=1)
     varied = (table["error"] == "aligned ATE (m)") & (table["estimator"] == "vote of all points")
     assert has_deviation.equals(varied) and varied.any()
-    text = report_study.latex_errors(table, 3)
-    assert "0.0000" not in text and text.count(report_study.NO_DEVIATION) == 6  # of 8 tables
-    assert report_study.NO_DEVIATION not in report_study.latex_errors(table)
+    text = study_report.latex_errors(table, 3)
+    assert "0.0000" not in text and text.count(study_report.NO_DEVIATION) == 6  # of 8 tables
+    assert study_report.NO_DEVIATION not in study_report.latex_errors(table)
 
 
 def test_failures_of_the_other_estimator_stand_in_the_summary():
@@ -391,10 +390,10 @@ HOSTILE = [
 
 
 def test_names_stay_names_in_texts_and_tables(tmp_path):
-    shown = [html.escape(one_line(name)) for name in HOSTILE]
+    shown = [escape(one_line(name)) for name in HOSTILE]
     rows = pd.DataFrame({"sequence": HOSTILE, "masks": HOSTILE, "ate": -1.0})
     style.save_table(rows, tmp_path, "table", HOSTILE[0])
-    read = texts.html((tmp_path / "table.md").read_text(encoding="utf-8"))
+    read = html.from_markdown((tmp_path / "table.md").read_text(encoding="utf-8"))
     assert read.count("<td") == 3 * len(HOSTILE) and f"<p>{shown[0]}</p>" in read
     assert all(read.count(f">{name}</td>") == 2 for name in shown)
     # a spreadsheet must not calculate with it, and the page shows it as it is in the file

@@ -13,9 +13,9 @@ from thesis_repro.command.cli import main
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.data.trajectories import write_kitti_poses
 from thesis_repro.odometry import metrics
-from thesis_repro.report import study as report
+from thesis_repro.report import study_report as report
 from thesis_repro.study import sources
-from thesis_repro.study.study import Study
+from thesis_repro.study.plan import Study
 
 
 @pytest.fixture

@@ -15,7 +15,7 @@ from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.odometry import metrics
 from thesis_repro.odometry.keypoints import filtered
-from thesis_repro.running import messages
+from thesis_repro.running import program
 from thesis_repro.segmentation import training
 from thesis_repro.study import compare, methods, runner, workers
 from thesis_repro.study.jobs import Job, first_jobs
@@ -101,7 +101,7 @@ def test_a_failed_run_is_reported_and_stops_no_other_run(
     shutil.copytree(small_labels, tmp_path / "labels")
     broken = tmp_path / "labels" / "00" / "000003.png"
     broken.write_bytes(broken.read_bytes()[:-20])
-    messages.print_messages()
+    program.print_messages()
     jobs = [
         *first_jobs(opened(small_world)[:1], {"thesis": WIDTHS}),
         Job("00", "true-labels", 10),

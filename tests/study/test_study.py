@@ -19,11 +19,11 @@ from thesis_repro.data.cityscapes import ID, TRAINED
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.mask_files import LabelMasks, write_masks
-from thesis_repro.report import study as report
+from thesis_repro.report import study_report as report
 from thesis_repro.running.files import write_png
 from thesis_repro.study import runner
+from thesis_repro.study.plan import Study
 from thesis_repro.study.sources import Source
-from thesis_repro.study.study import Study
 
 FRAMES = 6
 

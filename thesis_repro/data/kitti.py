@@ -21,7 +21,7 @@ from thesis_repro.data.trajectories import (
     text_of,
 )
 from thesis_repro.errors import InputError
-from thesis_repro.running import messages
+from thesis_repro.running import program
 from thesis_repro.running.files import images, read_gray
 
 # Intrinsics in pixels at the stated image size (Section 3.7.2); KITTI's gray images have no
@@ -193,7 +193,7 @@ def _may_be_nanoseconds(ordered: list[Path], fractions: list[str]) -> bool:
 
 @cache
 def _say_once(line: str) -> None:
-    messages.log.info(line)
+    program.log.info(line)
 
 
 class Sequence:

@@ -14,7 +14,7 @@ from thesis_repro.data.cityscapes import ID, LABELS, TRAINED, read_label_map
 from thesis_repro.data.trajectories import text_of
 from thesis_repro.errors import InputError
 from thesis_repro.running.files import read_color, read_ids
-from thesis_repro.running.results import digest_of_file
+from thesis_repro.running.provenance import digest_of_file
 
 LABEL_IDS, TRAIN_IDS, COLORS = "labels", "train", "colors"
 NOT_NAMED = 255  # no label id

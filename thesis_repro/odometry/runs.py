@@ -13,7 +13,7 @@ from thesis_repro.errors import InputError
 from thesis_repro.odometry.odometry import PROBABILITY, STATIONARY, Calls, Odometry, detect
 from thesis_repro.odometry.settings import THESIS, OdometrySettings
 from thesis_repro.odometry.types import EQUAL, FRAME_COLUMNS, ROTATION_COLUMNS, TIMED_PARTS
-from thesis_repro.running import messages
+from thesis_repro.running import program
 from thesis_repro.running.files import progress
 
 # Frames from which faster calls with OpenCV's bits pay. To load them takes 2 s, to compile 25 s;
@@ -221,7 +221,7 @@ def _indices(sequence: Sequence, description: str | None) -> Iterable[int]:
         yield from progress(range(len(sequence)), description)
         return
     for index in range(len(sequence)):
-        with messages.unstopped():
+        with program.unstopped():
             yield index
 
 

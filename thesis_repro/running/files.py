@@ -16,7 +16,7 @@ from PIL import Image
 from tqdm import tqdm
 
 from thesis_repro.errors import InputError
-from thesis_repro.running import messages
+from thesis_repro.running import program
 
 # matches the names that `temporary_path` returns
 TEMPORARY = re.compile(r"\..*\.thesis-repro-[0-9a-f]{8}(\..*)?")
@@ -161,11 +161,11 @@ def needed(path: str | Path, notebook: str) -> Path:
 
 
 class _Bar(tqdm):
-    """A progress bar over steps that a signal to stop does not break (`messages.unstopped`)."""
+    """A progress bar over steps that a signal to stop does not break (`program.unstopped`)."""
 
     def __iter__(self) -> Iterator[Any]:
         for item in super().__iter__():
-            with messages.unstopped():
+            with program.unstopped():
                 yield item
 
 

@@ -15,7 +15,7 @@ from typing import Any
 from joblib import cpu_count as cores
 
 from thesis_repro.errors import InputError
-from thesis_repro.running import messages
+from thesis_repro.running import program
 
 ROOT = Path(__file__).resolve().parents[2]  # of the checkout
 PREFIX = "THESIS_REPRO_"
@@ -335,4 +335,4 @@ def _changed_sizes(profile: str, sizes: Profile) -> dict[str, str]:
 
 
 if __name__ == "__main__":  # the Makefile asks for the folder of the run, below its own
-    messages.run_main(lambda: print(os.path.relpath(read_settings().build, ROOT)))
+    program.run_main(lambda: print(os.path.relpath(read_settings().build, ROOT)))

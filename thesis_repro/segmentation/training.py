@@ -21,7 +21,7 @@ import tensorflow as tf
 from thesis_repro import segmentation
 from thesis_repro.data.cityscapes import CLASS_WEIGHTS, N_CLASSES
 from thesis_repro.errors import InputError
-from thesis_repro.running import files, results
+from thesis_repro.running import files, provenance
 from thesis_repro.segmentation import augmentation
 from thesis_repro.segmentation.exact import same_bits
 
@@ -184,8 +184,10 @@ def made_from(model: Any, batches: Batches, validation: Batches) -> dict[str, An
     predicted = random.dirichlet(np.ones(N_CLASSES), true.shape[:3]).astype(np.float32)
     arrays = [array for pair in (*batches.sets, *validation.sets) for array in pair]
     return {
-        "code": results.digest_of_code("thesis_repro.segmentation", "thesis_repro.data.cityscapes"),
-        **results.made_with("tensorflow", "keras", "albumentations"),
+        "code": provenance.digest_of_code(
+            "thesis_repro.segmentation", "thesis_repro.data.cityscapes"
+        ),
+        **provenance.made_with("tensorflow", "keras", "albumentations"),
         "arithmetic": segmentation.arithmetic(),
         "network": zlib.crc32(json.dumps(model.get_config(), default=str).encode()),
         "first_weights": weights_digest(model),

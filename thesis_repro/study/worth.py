@@ -76,7 +76,7 @@ from thesis_repro.odometry.odometry import MIN_MATCHES, PROBABILITY, normalise
 from thesis_repro.odometry.refined.fit import fit, smaller_rotation
 from thesis_repro.odometry.runs import check, inside
 from thesis_repro.odometry.sharing import SharedCalls
-from thesis_repro.running import results
+from thesis_repro.running import provenance
 from thesis_repro.running.files import progress
 from thesis_repro.study import compare, jobs, methods
 from thesis_repro.study.runner import CODE
@@ -331,16 +331,16 @@ def measure(
     files: dict[Path, tuple] = {}
     for sequence in sequences:
         inputs = {
-            "sequence": results.digest_of_files(sequence.files),
+            "sequence": provenance.digest_of_files(sequence.files),
             "sources": [source.record(sequence.name) for source in sources],
             "width": width,
             "options": options,
-            "code": results.digest_of_code(
+            "code": provenance.digest_of_code(
                 *CODE, "thesis_repro.study.methods", "thesis_repro.study.worth"
             ),
-            **results.made_with("opencv", "numpy", "numba"),
+            **provenance.made_with("opencv", "numpy", "numba"),
         }
-        stage = results.stage(folder / sequence.name, **inputs)
+        stage = provenance.stage(folder / sequence.name, **inputs)
         for number in numbers:
             files[stage / f"{number}.csv"] = sequence, sources, width, number, options
     waiting = [(file, *call) for file, call in files.items() if not file.is_file()]
@@ -369,7 +369,7 @@ def _measure_one(
     except Exception as error:  # of own keypoints
         reason = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
         raise InputError(f"{sequence.folder}: {reason}") from error
-    results.write_table(file, table)
+    provenance.write_table(file, table)
 
 
 # Over several streets

@@ -22,8 +22,8 @@ import pandas as pd
 from markupsafe import Markup
 
 from thesis import captions, timing
-from thesis_repro.report import page, texts
-from thesis_repro.running import messages, results
+from thesis_repro.report import html, texts
+from thesis_repro.running import program, provenance
 from thesis_repro.running.files import atomic, listed, write_text
 from thesis_repro.running.settings import ROOT, Settings, read_settings
 
@@ -40,17 +40,17 @@ def update(settings: Settings, folder: Path) -> None:
     Converts each executed notebook that is newer than its HTML. Deletes temporary files of killed
     runs. Raises InputError if another run uses the folder.
     """
-    with results.claimed(settings.build / "notebooks"):
-        results.sweep(settings.build)
+    with provenance.claimed(settings.build / "notebooks"):
+        provenance.sweep(settings.build)
         if folder.is_dir():
-            results.sweep(folder)
+            provenance.sweep(folder)
         _copy(settings, folder)
         settings = replace(settings, figures=folder)
         for path in _executed(settings):
-            html = path.with_suffix(".html")
-            if not html.is_file() or html.stat().st_mtime < path.stat().st_mtime:
-                write_text(html, notebook_html(path, folder / page.PAGE))
-        write_text(folder / page.PAGE, build(settings))
+            converted = path.with_suffix(".html")
+            if not converted.is_file() or converted.stat().st_mtime < path.stat().st_mtime:
+                write_text(converted, notebook_html(path, folder / html.PAGE))
+        write_text(folder / html.PAGE, build(settings))
         write_text(folder / GALLERY, gallery(settings))
 
 
@@ -139,9 +139,9 @@ def build(settings: Settings) -> str:
     of_thesis = [artefact for artefact in artefacts if artefact["number"] is not None]
     docs = _links_to_documents(settings)
     answer = _answer(docs) if docs and settings.figures_in_git else None
-    executed, made = [], page.made_with()
+    executed, made = [], html.made_with()
     if not settings.figures_in_git:  # a clone has no executed notebooks
-        executed, made = _executed(settings), made | page.made_on()
+        executed, made = _executed(settings), made | html.made_on()
     if executed:
         latest = max(path.stat().st_mtime for path in executed)
         made["day"] = f"{datetime.fromtimestamp(latest, UTC):%d %B %Y}"
@@ -166,7 +166,7 @@ def build(settings: Settings) -> str:
 def gallery(settings: Settings) -> str:
     """Return the gallery of a run as Markdown, made from the files in its folders."""
     chapters = _chapters(settings)
-    return texts.render("gallery.md.j2", settings=settings, chapters=chapters, page=page.PAGE)
+    return texts.render("gallery.md.j2", settings=settings, chapters=chapters, page=html.PAGE)
 
 
 def _links_to_documents(settings: Settings) -> str | None:
@@ -180,7 +180,7 @@ def _answer(docs: str) -> Markup:
     """Return the answer and what to do of docs/answer.md. docs: the way to that folder."""
     text = (ROOT / "docs" / "answer.md").read_text(encoding="utf-8")
     answer, to_do = (part.partition("\n\n")[2] for part in text.split("\n\n## ")[:2])
-    return texts.html(re.sub(r"\]\((?!\w+:|#)", f"]({docs}/", f"{answer}\n\n{to_do}"))
+    return html.from_markdown(re.sub(r"\]\((?!\w+:|#)", f"]({docs}/", f"{answer}\n\n{to_do}"))
 
 
 def _describe(
@@ -191,7 +191,7 @@ def _describe(
     numbers: of the run, from `beside_the_thesis`.
     """
     name, needs = artefact["name"], artefact.get("needs")
-    described = page.describe(settings.figures, artefact)
+    described = html.describe(settings.figures, artefact)
     if name in captions.THESIS:
         # figure_4_07 is Figure 4.7, figure_a_01 is Figure A.1
         _, chapter, count = name.split("_")
@@ -254,9 +254,9 @@ def main() -> None:
     """Write the page and the gallery anew from the figures in git."""
     settings = read_settings()
     settings = replace(settings, figures=settings.published)
-    write_text(settings.figures / page.PAGE, build(settings))
+    write_text(settings.figures / html.PAGE, build(settings))
     write_text(settings.figures / GALLERY, gallery(settings))
 
 
 if __name__ == "__main__":
-    messages.run_main(main)
+    program.run_main(main)
