@@ -186,7 +186,8 @@ def summary(rows: pd.DataFrame, times: pd.DataFrame | None = None) -> pd.DataFra
     "as good" and "no worse" are "yes" if a rule holds for both errors and both estimators.
     """
     keys = ["choice", "number"]
-    lines = {}
+    milliseconds = {} if times is None else times.set_index(keys)["milliseconds"]
+    lines = []
     for (choice, number), chosen in rows.groupby(keys, sort=False):
         line = {"keypoints": f"{chosen['keypoints'].iloc[0]:.0f}", "how chosen": LABELS[choice]}
         for row in chosen.itertuples():
@@ -195,14 +196,13 @@ def summary(rows: pd.DataFrame, times: pd.DataFrame | None = None) -> pd.DataFra
             line[name] = f"{ratio} ({low}-{high}), {row.above} of {row.n}"
         for row in chosen.drop_duplicates("estimator").itertuples():
             line[f"failed, {ESTIMATORS[row.estimator]}"] = row.failed
-        lines[choice, number] = line
-    shown = pd.DataFrame.from_dict(lines, orient="index")
-    if times is not None:
-        shown["CPU time a frame (ms)"] = times.set_index(keys)["milliseconds"]
-    rules = rows.groupby(keys)[["as_good", "no_worse"]].all()
-    rules.loc["all"] = False  # nothing to compare
-    answers = rules.replace({True: "yes", False: ""})
-    return shown.join(answers.set_axis(["as good", "no worse"], axis=1)).reset_index(drop=True)
+        if times is not None:
+            line["CPU time a frame (ms)"] = milliseconds.get((choice, number))
+        for rule in ("as_good", "no_worse"):
+            is_so = choice != "all" and chosen[rule].all()
+            line[rule.replace("_", " ")] = "yes" if is_so else ""
+        lines.append(line)
+    return pd.DataFrame(lines)
 
 
 def figure(rows: pd.DataFrame, times: pd.DataFrame | None = None) -> Figure:
