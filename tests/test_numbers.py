@@ -438,7 +438,7 @@ FACTS = {
         3 to 5 times fewer; 5 to 10 % of; 95 % intervals; rows 47 and 16; Figure A.1; GPL-3.0;
         BY-NC-SA 3.0; CC BY-NC-SA 3.0""",
     "docs/answer.md": """
-        00, 01, 02, 05, 06 and 07; drives 0005 and 0095; width 10; street 01; 6 of 11.;
+        rotational RPE, 1 frame; 00, 01, 02, 05, 06 and 07; drives 0005 and 0095; width 10; street 01; 6 of 11.;
         best of 15; all 16 runs; One of 400 keypoints; Of 400 keypoints; and 6 or fewer;
         the 15 count; failed runs of 40; In drive 0005; more than 0.15 degrees; All 23 are;
         on 01, a ramp; 16 x 5 fields; on 07 are; by 180 degrees; failed runs of 32; 90 % interval;
