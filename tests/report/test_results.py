@@ -147,7 +147,7 @@ def test_errors_are_means_with_their_spread_and_the_lowest_is_bold():
     methods = ["all keypoints", "masks, width 10", *(compare.METHODS[name] for name in CONTROLS)]
     assert list(table["method"]) == 4 * methods and list(table.columns[3:]) == ELEVEN
     assert list(table["estimator"].unique()) == ["vote of all points", "refined estimator"]
-    assert list(table["error"].unique()) == ["aligned ATE (m)", "rotation error a frame (deg)"]
+    assert list(table["error"].unique()) == ["aligned ATE (m)", "rotational RPE, 1 frame (deg)"]
     masked = (runs["method"] == "masked") & (runs["dilation_width"] == 10)
     errors = runs[masked & (runs["estimator"] == "refined") & (runs["sequence"] == "03")]["se3"]
     cell = table[table["estimator"] == "refined estimator"].set_index("method").iloc[1]["03"]
@@ -222,9 +222,19 @@ def test_ratios_in_the_tables_equal_the_comparison():
 
 
 @pytest.mark.parametrize(
-    "value, text", [(1.09, "1.09"), (1.0018, "1.0018"), (0.9951, "0.9951"), (1.0, "1.00")]
+    "value, text",
+    [
+        (1.09, "1.09"),
+        (1.0018, "1.0018"),
+        (0.9951, "0.9951"),
+        (1.0, "1.00"),
+        (0.0041, "0.0041"),
+        (-0.004, "-0.0040"),
+        (0.0, "0.00"),
+        (float("nan"), "nan"),
+    ],
 )
-def test_a_ratio_near_one_has_more_digits(value, text):
+def test_a_ratio_near_zero_or_one_has_more_digits(value, text):
     assert texts.number(value) == text
 
 

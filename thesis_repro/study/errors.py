@@ -21,10 +21,10 @@ class Error(NamedTuple):
 
 
 # A constant angle between camera and ground truth leaves the aligned ATE alone. It changes the
-# rotation (the field's rotational RPE over one frame) by thousandths of a degree.
+# rotational RPE by thousandths of a degree.
 ERRORS = {
     "se3": Error("aligned ATE", "m", decides=True),
-    "rotation": Error("rotation error a frame", "deg", decides=True),
+    "rotation": Error("rotational RPE, 1 frame", "deg", decides=True),
     "rmse": Error("RMSE", "m"),
     "mae": Error("MAE", "m"),
     "translation_percent": Error(f"translation error over {RELATIVE_LENGTH:g} m", "%"),
