@@ -26,8 +26,8 @@ from thesis_repro.odometry import (
     sharing,
 )
 from thesis_repro.odometry.estimators import ESTIMATORS, refined
-from thesis_repro.odometry.odometry import VoteOfAll, detect, normalise, track
-from thesis_repro.odometry.types import ROTATION_COLUMNS
+from thesis_repro.odometry.loop import VoteOfAll, detect, normalise, track
+from thesis_repro.odometry.step import ROTATION_COLUMNS
 
 SMALL = replace(THESIS, max_keypoints=500)  # quicker
 COUNTS = {
@@ -278,7 +278,7 @@ def test_bad_frames_are_flagged_and_keep_the_pose(drive, case):
 def test_too_large_turns_are_flagged_and_kept(drive, monkeypatch, estimator):
     few, settings = Changed(drive, frames=4), replace(THESIS, estimator=ESTIMATORS[estimator].make)
     plain = odometry.run(few, settings)
-    monkeypatch.setattr(odometry.odometry, "MAX_TURN", 0.05)
+    monkeypatch.setattr(odometry.loop, "MAX_TURN", 0.05)
     flagged = odometry.run(few, settings)
     assert plain.flagged.empty and set(flags(flagged).values()) == {"too large a turn"}
     np.testing.assert_array_equal(flagged.poses, plain.poses)

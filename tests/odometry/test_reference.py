@@ -6,7 +6,6 @@ of the exact search on these points is shown in tests/opencv_exact.
 """
 
 import platform
-from functools import partial
 
 import numpy as np
 import pandas as pd
@@ -18,10 +17,9 @@ from reference_steps import ESTIMATORS, FOLDER, STEPS, digest
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.mask_files import MaskFolder
 from thesis_repro.odometry import THESIS, Matches, metrics
-from thesis_repro.odometry.odometry import PROBABILITY, VoteOfAll, normalise
+from thesis_repro.odometry.loop import VoteOfAll, normalise
 from thesis_repro.odometry.refined import RefinedEstimator
 
-search = partial(opencv_exact.find_essential_matrix, probability=PROBABILITY)
 IS_X86 = platform.machine() in ("x86_64", "AMD64")
 # (run, frame): on ARM, RANSAC takes another sample, or the camera hardly moves, or not at all
 OTHERWISE = {("00_masked", 3), ("02", 82), ("07", 1), ("07_masked", 4), ("no_parallax", None)}
@@ -50,7 +48,7 @@ def test_real_steps_have_the_recorded_bits(run):
     for step in recorded(run):
         points = step["current"], step["previous"]
         if IS_X86 or (run, step.get("frames")) not in OTHERWISE:
-            matrix, inliers = search(*points, THESIS.threshold)
+            matrix, inliers = opencv_exact.find_essential_matrix(*points, THESIS.threshold)
             assert_recorded(matrix, step["matrices"])
             np.testing.assert_array_equal(inliers.ravel() > 0, step["inliers"])
         if step["solutions"] == 1:
@@ -85,7 +83,7 @@ def shuffled_motions(run, seed, moves):
     for step in recorded(run):
         order = np.random.default_rng((seed, step["frames"])).permutation(step["matches"])
         points = step["current"][order], step["previous"][order]
-        matrix, inliers = search(*points, THESIS.threshold)
+        matrix, inliers = opencv_exact.find_essential_matrix(*points, THESIS.threshold)
         matches = Matches(*points, THESIS.threshold, inliers.ravel() > 0)
         motions.append((step, refined.motion(matrix, matches, step["scales"], moves)))
     return motions

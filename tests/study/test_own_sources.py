@@ -141,7 +141,7 @@ def test_own_keypoints_are_drawn(street, capsys):
 
 
 BREAKING = """
-from thesis_repro.odometry.odometry import detect as usual
+from thesis_repro.odometry.loop import detect as usual
 calls = []
 def detect(frame, settings, mask):
     calls.append(frame)

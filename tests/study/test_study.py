@@ -181,7 +181,7 @@ def test_each_folder_of_label_maps_may_name_its_ids(small_world, small_labels, t
 @pytest.fixture
 def brought(study, done, tmp_path):
     """A study of own keypoints, which are all keypoints, and of the paths with all keypoints."""
-    (tmp_path / "mine.py").write_text("from thesis_repro.odometry.odometry import detect\n")
+    (tmp_path / "mine.py").write_text("from thesis_repro.odometry.loop import detect\n")
     (tmp_path / "slam").mkdir()
     for name, form in (("00", "kitti"), ("01", "tum")):
         written = done[0] / "paths" / form / name / "baseline-0.txt"

@@ -72,7 +72,7 @@ from thesis_repro.odometry import (
     scales,
 )
 from thesis_repro.odometry.keypoints import filled, spread
-from thesis_repro.odometry.odometry import MIN_MATCHES, PROBABILITY, normalise
+from thesis_repro.odometry.loop import MIN_MATCHES, normalise
 from thesis_repro.odometry.refined.fit import fit, smaller_rotation
 from thesis_repro.odometry.runs import check, inside
 from thesis_repro.odometry.sharing import SharedCalls
@@ -141,7 +141,7 @@ def worth(
     steps = steps[spaced.round().astype(int)]
     shared = SharedCalls()
     rows: list[dict] = []
-    for index in steps if description is None else progress(steps, description):
+    for index in progress(steps, description):
         random, chosen = tracked(sequence, int(index), choices, shared, calls)
         references: dict[tuple, dict] = {}  # of random keypoints
         for (name, number), tracks in chosen.items():
@@ -174,6 +174,7 @@ def tracked(
 ) -> tuple[Tracks, dict[tuple[str, int], Tracks]]:
     """Return all keypoints of frame `index`, and those of each choice, tracked into the next."""
     frame, following = sequence.frame(index), sequence.frame(index + 1)
+    frame.setflags(write=False)  # so that all choices share it
     visible = sequence.visible(index)
     made = {id(masks): masks[index] for _, masks in choices.values() if masks is not None}
     everything = {_RANDOM: (THESIS, None), **choices}
@@ -246,9 +247,7 @@ def refined_motion(tracks: Tracks, indices: np.ndarray) -> Motion | None:
     if len(indices) < MIN_MATCHES:
         return None
     current, previous = tracks.current[indices], tracks.previous[indices]
-    matrix, inliers = opencv_exact.find_essential_matrix(
-        current, previous, tracks.threshold, PROBABILITY
-    )
+    matrix, inliers = opencv_exact.find_essential_matrix(current, previous, tracks.threshold)
     if matrix is None or inliers is None or matrix.shape != (3, 3) or not np.isfinite(matrix).all():
         return None
     matches = Matches(current, previous, tracks.threshold, inliers.ravel() > 0)
