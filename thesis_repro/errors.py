@@ -44,6 +44,13 @@ class InputError(ValueError):
         return [f"InputError: {self}"]
 
 
+def cause(error: Exception) -> str:
+    """Return why something failed as one line; of other errors than bad input with their name."""
+    if isinstance(error, InputError):
+        return str(error)
+    return f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
+
+
 def need(name: str, value: object, kind: Any) -> None:
     """Raise InputError unless an argument of a public function is of a kind: a type, or "A | B"."""
     if not isinstance(value, kind):

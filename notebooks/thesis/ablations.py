@@ -130,7 +130,7 @@ def measure(
     labels: a folder with one folder of label maps a sequence. folder: for the results; finished
     sequences in it are not run again. repetitions, dilation_width: see `runs_of`.
 
-    Columns: sequence, method, estimator, repetition, those of `runner.measures`, and sim3 (RMSE in
+    Columns: sequence, method, estimator, repetition, those of `runner.run_all`, and sim3 (RMSE in
     metres after an alignment with scale).
     """
     opened = list(sequences)

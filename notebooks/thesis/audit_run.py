@@ -16,12 +16,12 @@ from thesis import ablations, artefacts, audit_rows, domain_gap, section_4_2, ti
 from thesis.audit import measurement
 from thesis_repro.data import cityscapes
 from thesis_repro.data.cityscapes import ID, read_label_map
-from thesis_repro.data.kitti import Sequence
+from thesis_repro.data.kitti import TRUE_LABELS, Sequence
 from thesis_repro.mask_files import LabelMasks
 from thesis_repro.running.settings import Settings
 from thesis_repro.segmentation import augmentation, training
 from thesis_repro.study.jobs import CONTROL_WIDTH
-from thesis_repro.study.methods import METHODS, true_labels
+from thesis_repro.study.methods import METHODS
 from thesis_repro.study.sources import Source
 
 SMALL = [ID[name] for name in ("pole", "traffic light", "traffic sign", "person")]
@@ -65,7 +65,7 @@ def boundaries(drives: list[Sequence], labels: Path, pairs: int) -> pd.DataFrame
     """
     rows = []
     for drive in drives:
-        thin_folder = true_labels(drive.root, drive.name)
+        thin_folder = drive.folder / TRUE_LABELS
         if not thin_folder.is_dir():
             thin_folder = labels / drive.name
         for index in range(0, len(drive), max(1, len(drive) // pairs)):
@@ -80,7 +80,7 @@ def boundaries(drives: list[Sequence], labels: Path, pairs: int) -> pd.DataFrame
 
 def masks_by_name(drive: Sequence, labels: Path) -> dict[str, Any]:
     """Return the masks of a sequence that place keypoints differently, for `ablations.tracks`."""
-    own_folder, true_folder = labels / drive.name, true_labels(drive.root, drive.name)
+    own_folder, true_folder = labels / drive.name, drive.folder / TRUE_LABELS
     by_name: dict[str, Any] = {
         "all keypoints": [None] * len(drive),
         "masks": LabelMasks(own_folder, drive, CONTROL_WIDTH),
@@ -97,7 +97,7 @@ def right_pixels(settings: Settings, drives: list[Sequence], labels: Path) -> pd
     rows = []
     for drive in drives:
         whole = Sequence(settings.kitti, drive.name).subset(settings.sizes.frames).subset(FRAMES)
-        true_folder = true_labels(settings.kitti, drive.name)
+        true_folder = drive.folder / TRUE_LABELS
         for index, path in enumerate(whole.frame_paths):
             if (true_folder / path.name).is_file():
                 predicted = read_label_map(labels / drive.name / path.name)
