@@ -101,16 +101,20 @@ def _errors(chosen: pd.DataFrame, reference: pd.DataFrame) -> dict:
         passes = failing <= failing_of_all
         for error, margin in few_keypoints.MARGINS.items():
             ratios = compare.ratios(of_choice, of_all, error)
-            numbers = compare.typical_ratio(ratios)
-            ratio, low, high = (texts.number(numbers[name]) for name in ("ratio", "low", "high"))
-            interval = "" if np.isnan(numbers["low"]) else f" ({low}-{high})"
-            text = f"{ratio}{interval}, {numbers['above']} of {numbers['n']} above 1"
-            row[f"{few_keypoints.ERRORS[error]}, {title}"] = text
+            row[f"{compare.METRICS[error]}, {title}"] = ratio_text(ratios)
             passes &= few_keypoints.within(ratios, margin)["no_worse"]
         row[f"no worse (rule 5), {title}"] = "yes" if passes else ""
         no_worse.append(passes)
     row["no worse (rule 5)"] = "yes" if all(no_worse) else ""
     return row
+
+
+def ratio_text(ratios: pd.Series) -> str:
+    """Return the typical ratio of streets as text, such as "1.09 (0.98-1.32), 6 of 8 above 1"."""
+    numbers = compare.typical_ratio(ratios)
+    ratio, low, high = (texts.number(numbers[name]) for name in ("ratio", "low", "high"))
+    interval = "" if np.isnan(numbers["low"]) else f" ({low}-{high})"
+    return f"{ratio}{interval}, {numbers['above']} of {numbers['n']} above 1"
 
 
 def _failing_streets(runs: pd.DataFrame) -> int:

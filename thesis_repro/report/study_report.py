@@ -14,10 +14,10 @@ from matplotlib.figure import Figure
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.data.trajectories import write_kitti_poses, write_tum
 from thesis_repro.errors import one_line
-from thesis_repro.mask_files import LabelMasks, label_map_of
+from thesis_repro.mask_files import LabelMasks
 from thesis_repro.masks import MaskSettings
 from thesis_repro.odometry import THESIS, metrics
-from thesis_repro.odometry.odometry import detect
+from thesis_repro.odometry.loop import detect
 from thesis_repro.odometry.runs import inside
 from thesis_repro.report import comparison, findings, html, paths, style, worth
 from thesis_repro.running import provenance
@@ -194,7 +194,7 @@ def figure_sources(study: Study, runs: pd.DataFrame) -> Figure:
         else:
             masks = source.masks(sequence, study.shown_width)
             if isinstance(masks, LabelMasks):
-                label_maps.append(label_map_of(masks, index))
+                label_maps.append(masks.label_map(index))
                 colors = style.label_colors(label_maps[-1], frame)
                 style.show_image(first, colors, f"{source.name}: label map")
             mask = masks[index]

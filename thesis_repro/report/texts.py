@@ -37,9 +37,9 @@ def render(template: str, **values: Any) -> str:
 
 
 def number(value: float) -> str:
-    """Return a ratio as text with two digits, or with more if it would look like 1."""
+    """Return a ratio as text with two digits, or with more if it would look like 0 or 1."""
     digits = DIGITS
-    distance = abs(value - 1)
+    distance = min(abs(value), abs(value - 1))
     if 0 < distance < 0.5 * 10**-DIGITS:
         digits = min(6, ceil(-log10(distance)) + 1)
     return f"{value:.{digits}f}"

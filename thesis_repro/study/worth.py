@@ -74,7 +74,7 @@ from thesis_repro.odometry import (
     scales,
 )
 from thesis_repro.odometry.keypoints import filled, spread
-from thesis_repro.odometry.odometry import MIN_MATCHES, PROBABILITY, normalise
+from thesis_repro.odometry.loop import MIN_MATCHES, normalise
 from thesis_repro.odometry.refined.fit import fit, smaller_rotation
 from thesis_repro.odometry.runs import check, inside
 from thesis_repro.odometry.sharing import SharedCalls
@@ -171,6 +171,7 @@ def tracked(
 ) -> tuple[Tracks, dict[tuple[str, int], Tracks]]:
     """Return all keypoints of frame `index`, and those of each choice, tracked into the next."""
     frame, following = sequence.frame(index), sequence.frame(index + 1)
+    frame.setflags(write=False)  # so that all choices share it
     visible = sequence.visible(index)
     made = {id(masks): masks[index] for _, masks in choices.values() if masks is not None}
     everything = {_RANDOM: (THESIS, None), **choices}
@@ -231,9 +232,7 @@ def refined_motion(tracks: Tracks, indices: np.ndarray) -> Motion | None:
     if len(indices) < MIN_MATCHES:
         return None
     current, previous = tracks.current[indices], tracks.previous[indices]
-    matrix, inliers = opencv_exact.find_essential_matrix(
-        current, previous, tracks.threshold, PROBABILITY
-    )
+    matrix, inliers = opencv_exact.find_essential_matrix(current, previous, tracks.threshold)
     if matrix is None or inliers is None or matrix.shape != (3, 3) or not np.isfinite(matrix).all():
         return None
     matches = Matches(current, previous, tracks.threshold, inliers.ravel() > 0)
