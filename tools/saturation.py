@@ -91,6 +91,6 @@ def figure(worths) -> Figure:
         panel.minorticks_off()
     ticks = [25, 50, 100, 200, 400, 800, 1600]
     panels[0].set_yticks(ticks, list(map(str, ticks)))
-    panels[0].set_ylabel(f"tell as much as so many of {REFERENCE} random ones")
+    panels[0].set_ylabel("equivalent number of random ones")
     style.legend_below(drawing, panels[:1], 3)
     return drawing
