@@ -17,7 +17,7 @@ from joblib import Parallel, delayed, effective_n_jobs
 
 from street_world import drives, street, textures
 from thesis_repro.data import kitti, trajectories
-from thesis_repro.running import messages, results
+from thesis_repro.running import program, provenance
 from thesis_repro.running.files import progress, write_png, write_text
 
 SEQUENCES = tuple(drives.DRIVES)
@@ -151,7 +151,7 @@ def write(
     sequences: names among 00 to 10; frames: frames of each sequence, None for its whole drive (41
     to 132); scale: of KITTI's image size, and of 1024x512 for the training images; jobs: number of
     processes, -1 for one a core.
-    replace: move an embedded world of other parameters aside first (see `results.stage`). A
+    replace: move an embedded world of other parameters aside first (see `provenance.stage`). A
     complete world of the same parameters is kept.
     only: "kitti" or "cityscapes", to write one of the two.
     Returns (number of pictures rendered, number of pictures in total).
@@ -167,9 +167,9 @@ def write(
         "validation_images": validation_images,
         "seed": seed,
     }
-    with results.claimed(out):
-        results.stage(
-            out, replace=replace, code=results.digest_of_code("street_world"), **parameters
+    with provenance.claimed(out):
+        provenance.stage(
+            out, replace=replace, code=provenance.digest_of_code("street_world"), **parameters
         )
         pictures = []
         for picture in _pictures(out, **parameters):
@@ -240,12 +240,12 @@ def _write_missing(missing: list[Picture], jobs: int) -> None:
         parallel = Parallel(
             n_jobs=workers,
             return_as="generator_unordered",
-            initializer=messages.leave_ctrl_c_to_parent,
+            initializer=program.leave_ctrl_c_to_parent,
         )
         # Ten at a time, because pictures of one sequence share its street.
         starts = range(1, len(missing), 10)
         work = (delayed(_write_pictures)(missing[start : start + 10]) for start in starts)
-        with messages.starting_workers():
+        with program.starting_workers():
             counts = parallel(work)
         for count in counts:
             bar.update(count)

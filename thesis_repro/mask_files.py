@@ -12,8 +12,8 @@ import numpy as np
 from thesis_repro.data import label_ids
 from thesis_repro.data.kitti import Sequence, check_size
 from thesis_repro.errors import InputError
-from thesis_repro.masks import THESIS_MASKS, MaskSettings, check, forget, keypoint_mask
-from thesis_repro.running import results
+from thesis_repro.masks import THESIS_MASKS, MaskSettings, check_width, forget, keypoint_mask
+from thesis_repro.running import provenance
 from thesis_repro.running.files import listed, progress, read_gray, write_png
 
 ENDINGS = (".png", ".jpg", ".jpeg")  # of masks, in small or capital letters
@@ -40,15 +40,20 @@ class LabelMasks:
         self.size = sequence.size
         self.dilation_width = dilation_width
         self.settings = settings
-        check(dilation_width, self.size, settings)
+        if settings.has_width:
+            check_width(dilation_width, self.size)
 
     def __len__(self) -> int:
         return len(self.paths)
 
-    def __getitem__(self, index: int) -> np.ndarray:
+    def label_map(self, index: int) -> np.ndarray:
+        """Label map of frame `index`, in label ids."""
         path = self.paths[index]
         status = os.stat(path)
-        label_map = _read_once(path, self.settings.ids, status.st_mtime_ns, status.st_size)
+        return _read_once(path, self.settings.ids, status.st_mtime_ns, status.st_size)
+
+    def __getitem__(self, index: int) -> np.ndarray:
+        label_map = self.label_map(index)
         return keypoint_mask(label_map, self.size, self.dilation_width, self.settings)
 
     def record(self) -> list[Any]:
@@ -61,11 +66,6 @@ class LabelMasks:
         for path in [path for path in self.paths if (path, ids) not in known]:
             label_ids.read(path, ids)
             known.add((path, ids))
-
-
-def label_map_of(masks: LabelMasks, index: int) -> np.ndarray:
-    """Label map of frame `index`, in label ids."""
-    return label_ids.read(masks.paths[index], masks.settings.ids)
 
 
 @lru_cache(maxsize=2)  # masks of several settings, and controls, share label maps
@@ -83,20 +83,20 @@ def forget_edges() -> None:
 def write_masks(masks: LabelMasks, folder: str | Path) -> None:
     """Write the mask of every frame as a PNG with the frame's name (A.8). `MaskFolder` reads them.
 
-    The folder is a stage (see results): a stopped run resumes, and masks made from other label maps
-    or settings are moved aside.
+    The folder is a stage (see provenance): a stopped run resumes, and masks made from other label
+    maps or settings are moved aside.
     """
-    with results.claimed(folder):
-        folder = results.stage(
+    with provenance.claimed(folder):
+        folder = provenance.stage(
             folder,
-            labels=results.digest_of_files(masks.paths),
+            labels=provenance.digest_of_files(masks.paths),
             size=masks.size,
             **asdict(masks.settings),
             **label_ids.record(masks.settings.ids),
             dilation_width=masks.dilation_width,
-            frames=results.digest_of_files(masks.frame_paths),
-            code=results.digest_of_code("thesis_repro.masks", "thesis_repro.data"),
-            **results.made_with("opencv"),
+            frames=provenance.digest_of_files(masks.frame_paths),
+            code=provenance.digest_of_code("thesis_repro.masks", "thesis_repro.data"),
+            **provenance.made_with("opencv"),
         )
         for index, path in enumerate(progress(masks.paths, f"masks, width {masks.dilation_width}")):
             if not (folder / path.name).is_file():

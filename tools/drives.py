@@ -5,7 +5,7 @@ The Makefile runs it while notebook 4 trains the network, to save time.
 
 import street_world
 import thesis_repro as tr
-from thesis_repro.running import messages
+from thesis_repro.running import program
 from thesis_repro.running.settings import read_settings
 
 
@@ -25,4 +25,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    messages.run_main(main)
+    program.run_main(main)

@@ -26,7 +26,7 @@ from thesis_repro.errors import InputError
 from thesis_repro.odometry import metrics
 from thesis_repro.report import style, texts
 from thesis_repro.report import worth as report_worth
-from thesis_repro.running import messages, results
+from thesis_repro.running import program, provenance
 from thesis_repro.running.files import needed, write_text
 from thesis_repro.running.settings import ROOT, read_settings
 from thesis_repro.study import jobs, runner, worth
@@ -97,7 +97,7 @@ def write(settings, folder, others=()):
         sequences, labels, settings.sizes.widths, settings.build / "refined_widths", settings.jobs
     )
     streets = _streets(sequences)
-    results.sweep(folder)
+    provenance.sweep(folder)
     for name in KEPT:
         _copy(settings.figures, name, folder)
     style.save_all(
@@ -217,10 +217,10 @@ def main():
     folders = [("labels", None, Path(path)) for path in sys.argv[1:]]
     others = named(folders, masks.MaskSettings())
     folder = settings.build / "evidence"
-    with results.claimed(folder):
+    with provenance.claimed(folder):
         write(settings, FOLDER, others)
-        messages.summary(f"tables, plots and findings: {FOLDER}")
+        program.summary(f"tables, plots and findings: {FOLDER}")
 
 
 if __name__ == "__main__":
-    messages.run_main(main)
+    program.run_main(main)

@@ -8,7 +8,7 @@ import subprocess
 import tempfile
 from pathlib import Path
 
-from thesis_repro.running import messages
+from thesis_repro.running import program
 from thesis_repro.running.files import write_text
 from thesis_repro.running.settings import ROOT
 
@@ -33,4 +33,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    messages.run_main(main)
+    program.run_main(main)

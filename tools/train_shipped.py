@@ -23,7 +23,7 @@ from keras import ops
 
 from street_world import dataset as world
 from thesis_repro.data import cityscapes
-from thesis_repro.running import files, messages, results
+from thesis_repro.running import files, program, provenance
 from thesis_repro.segmentation import augmentation, prediction, quality, training
 from thesis_repro.segmentation.unet import build_unet
 
@@ -217,12 +217,12 @@ def train(camvid, kitti_semantic, pseudo, folder):
     )
     optimizer.build(model.trainable_variables)
     made_from = {
-        "code": results.digest_of_code("thesis_repro.segmentation.unet"),
-        "tool": results.digest_of_file(Path(__file__)),
-        **results.made_with("tensorflow", "keras"),
+        "code": provenance.digest_of_code("thesis_repro.segmentation.unet"),
+        "tool": provenance.digest_of_file(Path(__file__)),
+        **provenance.made_with("tensorflow", "keras"),
         "phases": [COMMON, LAST],
         "steps": EPOCH,
-        "images": results.digest_of_files(
+        "images": provenance.digest_of_files(
             [file for pairs in sets.values() for pair in pairs for file in pair[1:]]
         ),
     }
@@ -231,7 +231,9 @@ def train(camvid, kitti_semantic, pseudo, folder):
         batches = Views(sources, phase)
         loss = weighted_loss(class_weights(sources, phase.shares))
         model.compile(optimizer, training.fused_loss(loss))
-        resumable = training.ResumableTraining(results.stage(folder / name, **made_from), batches)
+        resumable = training.ResumableTraining(
+            provenance.stage(folder / name, **made_from), batches
+        )
         model.fit(
             batches.dataset(),
             epochs=phase.epochs,
@@ -325,4 +327,4 @@ def main(arguments=None):
 
 
 if __name__ == "__main__":
-    messages.run_main(main)
+    program.run_main(main)

@@ -20,7 +20,7 @@ import pandas as pd
 import tensorflow as tf
 
 from thesis_repro.data import cityscapes, kitti
-from thesis_repro.running import files, messages, results
+from thesis_repro.running import files, program, provenance
 from thesis_repro.running.settings import ALL_WIDTHS, ROOT, read_settings
 from thesis_repro.segmentation import prediction, quality, training
 from thesis_repro.segmentation.unet import build_unet
@@ -58,7 +58,7 @@ def train(settings, seed):
     model.compile(
         keras.optimizers.Adam(sizes.learning_rate), training.fused_loss(training.total_loss())
     )
-    folder = results.stage(
+    folder = provenance.stage(
         settings.build / f"trainings/model_{seed}",
         **training.made_from(model, batches, validation),
     )
@@ -177,4 +177,4 @@ def main():
 
 
 if __name__ == "__main__":
-    messages.run_main(main)
+    program.run_main(main)

@@ -4,7 +4,7 @@ Every run differs from a reference run in one setting. The tables have the colum
 needs.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from itertools import product
@@ -20,11 +20,11 @@ from thesis_repro.data.cityscapes import ID, read_label_map, resize_bilinear
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.mask_files import LabelMasks
 from thesis_repro.masks import MaskSettings
-from thesis_repro.odometry import THESIS, OdometrySettings, estimators, keypoints, metrics
-from thesis_repro.odometry.odometry import detect, normalise, track
-from thesis_repro.odometry.runs import Masks
-from thesis_repro.running import results
+from thesis_repro.odometry import THESIS, estimators, keypoints, metrics
+from thesis_repro.odometry.loop import detect, normalise, track
+from thesis_repro.running import provenance
 from thesis_repro.study.jobs import CONTROL_WIDTH, Job
+from thesis_repro.study.methods import Choice
 from thesis_repro.study.runner import Run, run_all, run_poses
 
 ESTIMATORS = tuple(estimators.ESTIMATORS)
@@ -106,94 +106,98 @@ def half_in_turns(sequence: Sequence, into: bool, index: int) -> np.ndarray:
     if metrics.angles(motion) > metrics.TURN_RATE:
         middle = sequence.size[1] // 2
         turns_right = motion[0, 2] > 0  # the optical axis moves to the right
-        if turns_right == into:
-            mask[:, :middle] = 0
-        else:
-            mask[:, middle:] = 0
+        mask[np.s_[:, :middle] if turns_right == into else np.s_[:, middle:]] = 0
     return mask
 
 
 # The runs
 
 
-def measure(
+def run_choices(
+    choices: Callable[[Sequence], Mapping[str, Choice]],
     sequences: Iterable[Sequence],
     labels: Path,
     folder: Path,
-    *,
-    processes: int = 1,
+    code: str,
+    estimators: Iterable[str],
     repetitions: int = 1,
-    dilation_width: int = CONTROL_WIDTH,
+    processes: int = 1,
 ) -> pd.DataFrame:
-    """Run every ablation on every sequence; returns a table with one row a run.
+    """Run choices of keypoints on sequences by `runner.run_all`; returns a table, one row a run.
 
-    labels: a folder with one folder of label maps a sequence. folder: for the results; finished
-    sequences in it are not run again. repetitions, dilation_width: see `runs_of`.
+    choices: a function of a sequence that returns {method: (settings, masks)}. labels: a folder
+    with one folder of label maps a sequence. folder: for the results; those made from the same
+    label maps and by the same code, the file of `choices`, are not made again. A repetition other
+    than 0 is the seed that shuffles the matched points. The estimator "inliers" is run for all
+    keypoints and masks alone.
+    """
+    runs: dict[Job, Run] = {}
+    made_from = {}
+    for sequence in sequences:
+        maps = [labels / sequence.name / path.name for path in sequence.frame_paths]
+        made_from[sequence.name] = {
+            "choices": provenance.digest_of_file(code),
+            "labels": provenance.digest_of_files(maps),
+        }
+        for (method, (settings, given)), estimator, repetition in product(
+            choices(sequence).items(), estimators, range(repetitions)
+        ):
+            if estimator != "inliers" or method in ("baseline", "masked"):
+                job = Job(sequence.name, method, estimator=estimator, repetition=repetition)
+                runs[job] = sequence, job.changed(settings), given
+    return run_all(runs, folder, made_from=made_from, processes=processes).table
+
+
+def measure(
+    sequences: list[Sequence], labels: Path, folder: Path, repetitions: int = 1, processes: int = 1
+) -> pd.DataFrame:
+    """Run every ablation on every sequence with ESTIMATORS, see `run_choices`.
 
     Columns: sequence, method, estimator, repetition, those of `runner.measures`, and sim3 (RMSE in
     metres after an alignment with scale).
     """
-    opened = list(sequences)
-    runs: dict[Job, Run] = {}
-    made_from = {}
-    for sequence in opened:
-        maps = labels / sequence.name
-        runs |= runs_of(sequence, maps, repetitions, dilation_width)
-        made_from[sequence.name] = {
-            "dilation_width": dilation_width,
-            "ablations": results.digest_of_file(__file__),
-            "labels": results.digest_of_files([maps / path.name for path in sequence.frame_paths]),
-            "model": results.made_from(maps),
-        }
-    table = run_all(runs, folder, made_from=made_from, processes=processes).table
+    table = run_choices(
+        lambda sequence: choices(sequence, labels),
+        sequences,
+        labels,
+        folder,
+        __file__,
+        ESTIMATORS,
+        repetitions,
+        processes,
+    )
     poses = run_poses(table, folder)
-    true = {sequence.name: sequence.poses for sequence in opened}
+    true = {sequence.name: sequence.poses for sequence in sequences}
     pairs = zip(table["sequence"], table["run"])
     table["sim3"] = [metrics.ate(poses[name, run], true[name], "sim3") for name, run in pairs]
     return table
 
 
-def runs_of(
-    sequence: Sequence, labels: Path, repetitions: int = 1, dilation_width: int = CONTROL_WIDTH
-) -> dict[Job, Run]:
-    """Return the runs over one sequence, as `runner.run_all` takes them.
+def choices(sequence: Sequence, labels: Path) -> dict[str, Choice]:
+    """Return the ablations over one sequence: {method: (settings, masks)}.
 
-    labels: folder of the sequence's label maps. "baseline" (all keypoints) and "masked" use each of
-    ESTIMATORS, other methods the thesis's and the refined one. A repetition other than 0 is the
-    seed that shuffles the matched points.
+    labels: a folder with one folder of label maps a sequence.
     """
-    methods = _methods(sequence, labels, dilation_width)
-    runs: dict[Job, Run] = {}
-    for method, estimator, repetition in product(methods, ESTIMATORS, range(repetitions)):
-        if estimator == "inliers" and method not in ("baseline", "masked"):
-            continue
-        settings, method_masks = methods[method]
-        job = Job(sequence.name, method, estimator=estimator, repetition=repetition)
-        runs[job] = sequence, job.changed(settings), method_masks
-    return runs
-
-
-def _methods(
-    sequence: Sequence, labels: Path, dilation_width: int
-) -> dict[str, tuple[OdometrySettings, Masks | None]]:
-    """Return the ablations over one sequence: {method: (settings, masks)}."""
 
     def enlarged(index: int) -> np.ndarray:
-        label_map = read_label_map(labels / sequence.frame_paths[index].name)
+        label_map = read_label_map(thesis_masks.paths[index])
         return cv2.resize(label_map, sequence.size[::-1], interpolation=cv2.INTER_NEAREST)
 
     def nearest(index: int) -> np.ndarray:
-        return masks.dilate(cv2.Canny(enlarged(index), *masks.CANNY), dilation_width)
+        return masks.dilate(cv2.Canny(enlarged(index), *masks.CANNY), CONTROL_WIDTH)
 
     def without_vegetation(index: int) -> np.ndarray:
         return np.where(np.isin(enlarged(index), VEGETATION), np.uint8(0), np.uint8(255))
 
-    thesis_masks = LabelMasks(labels, sequence, dilation_width)
-    symmetric = LabelMasks(labels, sequence, dilation_width, MaskSettings(symmetric=True))
+    def random(amount: int | float) -> Choice:
+        return THESIS, FunctionMasks(partial(random_keypoints, sequence, amount))
+
+    thesis_masks = LabelMasks(labels, sequence, CONTROL_WIDTH)
+    symmetric = LabelMasks(labels, sequence, CONTROL_WIDTH, MaskSettings(symmetric=True))
     some_frames = range(0, len(sequence), max(1, len(sequence) // 8))
     numbers = [len(detect(sequence.frame(i), THESIS, thesis_masks[i])) for i in some_frames]
     number = round(np.mean(numbers))  # that masks leave
-    methods: dict[str, tuple[OdometrySettings, Masks | None]] = {
+    methods: dict[str, Choice] = {
         "baseline": (THESIS, None),
         "masked": (THESIS, thesis_masks),
         "filter": (replace(THESIS, detector=keypoints.filtered), thesis_masks),
@@ -202,8 +206,8 @@ def _methods(
         # Section 5.2.2: trees and bushes
         "no-vegetation": (THESIS, FunctionMasks(without_vegetation)),
         "strongest": (replace(THESIS, max_keypoints=max(1, number)), None),
-        "random": (THESIS, FunctionMasks(partial(random_keypoints, sequence, number))),
-        "dropout": (THESIS, FunctionMasks(partial(random_keypoints, sequence, 0.9))),
+        "random": random(number),
+        "dropout": random(0.9),
     }
     for few in FEW_KEYPOINTS:
         methods[f"strongest-{few}"] = replace(THESIS, max_keypoints=few), None

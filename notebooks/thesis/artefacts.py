@@ -1,6 +1,5 @@
 """Where a notebook finds the files of earlier ones, and where its figures and tables go."""
 
-import json
 from base64 import b64encode
 from collections.abc import Callable
 from pathlib import Path
@@ -30,21 +29,20 @@ def needed(name: str, notebook: str) -> Path:
     return files.needed(read_settings().build / name, notebook)
 
 
-def read_json(name: str, notebook: str) -> dict[str, Any]:
-    """Return what `write_json` wrote in another notebook, which `needed` names."""
-    return json.loads(needed(name, notebook).read_text(encoding="utf-8"))
+def used_model() -> Any:
+    """Load the model that made the label maps of the run, chosen as in notebook 5."""
+    from thesis_repro.segmentation import quietly
+
+    with quietly():  # what TensorFlow prints when it starts is no error
+        from thesis_repro.segmentation import prediction, training
+    if read_settings().uses_shipped_model:
+        return prediction.load_shipped()
+    return training.load_model(needed("model/model.keras", "04_training"))
 
 
-def write_json(name: str, values: dict[str, Any]) -> Path:
-    """Write a dict into a file in the folder of the run; return its path."""
-    return write_text(name, json.dumps(values, indent=1) + "\n")
-
-
-def write_text(name: str, text: str) -> Path:
-    """Write a text into a file in the folder of the run; return its path."""
-    path = read_settings().build / name
-    files.write_text(path, text)
-    return path
+def write_text(name: str, text: str) -> None:
+    """Write a text into a file in the folder of the run."""
+    files.write_text(read_settings().build / name, text)
 
 
 def save_figure(figure: plt.Figure, name: str, note: str = "") -> None:

@@ -1,8 +1,9 @@
 """The audit: where the thesis contradicts itself, its code or its libraries, and what that does.
 
-audit.json holds the rows. A measurement is one line of a row's numbers: notebook 09, `audit_rows`
-and `audit_run` make them, and `table` joins them to the rows. Ratios come from `study.compare`.
-Intervals of other means are those of Student's t over `n` values: sequences unless said otherwise.
+audit.json holds the rows. A measurement is one line of a row's numbers: notebook 09,
+`audit_of_tables` and `audit_of_data` make them, and `table` joins them to the rows. Ratios come
+from `study.compare`. Intervals of other means are those of Student's t over `n` values: sequences
+unless said otherwise.
 """
 
 import json
@@ -42,9 +43,7 @@ def measurement(
     """
     numbers = np.asarray(values, float).ravel()
     numbers = numbers[~np.isnan(numbers)]
-    mean = np.nan
-    if len(numbers):
-        mean = numbers.mean()
+    mean = numbers.mean() if len(numbers) else np.nan
     low, high = compare.mean_interval(numbers)
     texts = {"row": row, "quantity": quantity, "unit": unit}
     return {**texts, "value": mean, "low": low, "high": high, "n": len(numbers), **more}
@@ -61,18 +60,19 @@ def share(row: str, quantity: str, percentages: Any, **more: Any) -> dict[str, A
     return {**mean, "low": low, "high": high}
 
 
-def ratio(row: str, quantity: str, ratios: Any, **more: Any) -> dict[str, Any]:
-    """Return one measurement for a row of the audit: the ratio over one ratio a sequence."""
+def ratio(
+    row: str, quantity: str, ratios: Any, geometric_mean: bool = False, **more: Any
+) -> dict[str, Any]:
+    """Return one measurement for a row of the audit: the ratio over one ratio a sequence.
+
+    It is the typical ratio, or the geometric mean.
+    """
+    names = ("mean", "mean_low", "mean_high") if geometric_mean else ("ratio", "low", "high")
     typical = compare.typical_ratio(ratios)
-    interval = {"low": typical["low"], "high": typical["high"], "n": typical["n"]}
-    return measurement(row, quantity, [], "ratio", value=typical["ratio"], **interval, **more)
-
-
-def geometric_mean(row: str, quantity: str, ratios: Any, **more: Any) -> dict[str, Any]:
-    """Return one measurement for a row of the audit: the geometric mean of one ratio a sequence."""
-    mean = compare.typical_ratio(ratios)
-    interval = {"low": mean["mean_low"], "high": mean["mean_high"], "n": mean["n"]}
-    return measurement(row, quantity, [], "ratio", value=mean["mean"], **interval, **more)
+    value, low, high = (typical[name] for name in names)
+    return measurement(
+        row, quantity, [], "ratio", value=value, low=low, high=high, n=typical["n"], **more
+    )
 
 
 def table(measurements: list[dict[str, Any]], data: str = "this run") -> pd.DataFrame:
@@ -100,9 +100,7 @@ def rounded(value: float) -> float:
 
     Eight show whether an interval excludes 1.
     """
-    digits = 4
-    if abs(value - 1) < 5e-4:
-        digits = 8
+    digits = 8 if abs(value - 1) < 5e-4 else 4
     return float(f"{value:.{digits}g}")
 
 

@@ -10,14 +10,14 @@ and here (for this run's numbers).
 import json
 from pathlib import Path
 
-from thesis_repro.report import page
+from thesis_repro.report import html
 
 _HERE = Path(__file__).parent
 REPORTED = json.loads((_HERE / "reported.json").read_text(encoding="utf-8"))
 _CAPTIONS = json.loads((_HERE / "captions.json").read_text(encoding="utf-8"))
 # the 36 figures and 5 tables of the thesis in its order, {chapter: artefacts}
 CHAPTERS = _CAPTIONS["chapters"]
-_OF_STUDIES = {(artefact["kind"], artefact["name"]): artefact for artefact in page.ARTEFACTS}
+_OF_STUDIES = {(artefact["kind"], artefact["name"]): artefact for artefact in html.ARTEFACTS}
 # artefacts that are not in the thesis
 ADDED = [
     _OF_STUDIES.get((artefact["kind"], artefact["name"]), {}) | artefact

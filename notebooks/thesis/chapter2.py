@@ -3,7 +3,7 @@
 Diagrams are in `diagrams`; cells of the notebooks draw lines and bars of one formula or table.
 """
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import matplotlib.pyplot as plt
@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 
 from thesis_repro.odometry import metrics
-from thesis_repro.report import paths, style
+from thesis_repro.report import style
 from thesis_repro.report.style import BLUE, GREEN, KEYPOINT, ORANGE, RED, SKY
 
 
@@ -33,33 +33,39 @@ def figure_2_02(
     bias.
     """
     figure, axes = style.new_figure(2, 3, height=4.7, height_ratios=[1.35, 1])
-    (patch_panel, response_panel, activation_panel), lower = axes
     row, column = pixel
     height, width = patch.shape[:2]
-    limit = np.abs(feature_map).max()
-    style.show_image(patch_panel, patch[..., 0], f"input x, {height}x{width}", vmin=0, vmax=255)
-    style.show_image(
-        response_panel, feature_map, "feature map y", cmap="PuOr", vmin=-limit, vmax=limit
-    )
-    activation = f"normalised, ReLU: {activated[row, column]:.2f}"
-    style.show_image(activation_panel, activated, activation, vmin=0)
     reach = kernel.shape[0] // 2
-    _mark(figure, patch_panel, pixel, 2 * reach + 1, "gray value")
-    _mark(figure, response_panel, pixel, 1, "response")
-    _mark(figure, activation_panel, pixel, 1, "activation")
+    limit = np.abs(feature_map).max()
+    activation = f"normalised, ReLU: {activated[row, column]:.2f}"
+    gray, signed = {"vmin": 0, "vmax": 255}, {"cmap": "PuOr", "vmin": -limit, "vmax": limit}
+    for panel, image, title, look, unit, side in (
+        (
+            axes[0, 0],
+            patch[..., 0],
+            f"input x, {height}x{width}",
+            gray,
+            "gray value",
+            2 * reach + 1,
+        ),
+        (axes[0, 1], feature_map, "feature map y", signed, "response", 1),
+        (axes[0, 2], activated, activation, {"vmin": 0}, "activation", 1),
+    ):
+        style.show_image(panel, image, title, **look)
+        figure.colorbar(panel.images[0], ax=panel, shrink=0.85, pad=0.03, label=unit)
+        corner = (column - side / 2, row - side / 2)  # of a square around the pixel
+        panel.add_patch(Rectangle(corner, side, side, fill=False, edgecolor=RED))
     field = patch[row - reach : row + reach + 1, column - reach : column + reach + 1]
     # every number is rounded before it is used, so that a reader can check the sum
     weights = kernel.astype(float).round(4)
-    products = (field * weights).round(2)
-    terms = np.array([bias, *products.sum(axis=(0, 1))]).round(2) + 0.0  # no -0.00
-    show_numbers(lower[0], field[..., 0], "its receptive field x (marked)", ".0f")
-    show_numbers(lower[1], weights[..., 0], "times the kernel's weights w", ".4f")
-    show_numbers(lower[2], products[..., 0] + 0.0, "is w x", ".2f")
-    remark = ""
-    if len(terms) > 2:
-        remark = " (above: the first channel)"
+    products = (field * weights).round(2) + 0.0  # no -0.00
+    terms = np.array([bias, *products.sum(axis=(0, 1))]).round(2) + 0.0
+    show_numbers(axes[1, 0], field[..., 0], "its receptive field x (marked)", ".0f")
+    show_numbers(axes[1, 1], weights[..., 0], "times the kernel's weights w", ".4f")
+    show_numbers(axes[1, 2], products[..., 0], "is w x", ".2f")
     shown = " + ".join(f"{term:.2f}" if term >= 0 else f"({term:.2f})" for term in terms)
     total, unrounded = f"{terms.sum():.2f}", f"{feature_map[row, column]:.2f}"
+    remark = " (above: the first channel)" if len(terms) > 2 else ""
     remark += f"; {unrounded} before rounding" if unrounded != total else ""
     figure.supxlabel(f"y = b + Σ w x = {shown} = {total}{remark}", fontsize=9)
     return figure
@@ -75,16 +81,6 @@ def window_of_most_contrast(image: np.ndarray, side: int) -> tuple[slice, slice]
     return max(windows, key=lambda window: image[window].std())
 
 
-def _mark(
-    figure: plt.Figure, panel: plt.Axes, pixel: tuple[int, int], side: int, unit: str
-) -> None:
-    """Add a colour scale to an image, and a square of `side` pixels around a pixel."""
-    figure.colorbar(panel.images[0], ax=panel, shrink=0.85, pad=0.03, label=unit)
-    row, column = pixel
-    corner = (column - side / 2, row - side / 2)
-    panel.add_patch(Rectangle(corner, side, side, fill=False, edgecolor=RED))
-
-
 UNET_PARTS = {
     "InputLayer": ("input", "#999999"),
     "Activation": ("convolution, normalisation, ReLU", BLUE),
@@ -95,14 +91,6 @@ UNET_PARTS = {
 }
 
 
-class Box(NamedTuple):
-    """The box of a layer in Figure 2.7."""
-
-    left: float
-    right: float
-    middle: float  # height of its middle
-
-
 def figure_2_07(model: Any) -> plt.Figure:
     """Figure 2.7: the U-Net, one box a stage.
 
@@ -111,35 +99,32 @@ def figure_2_07(model: Any) -> plt.Figure:
     """
     figure, axes = style.new_figure(height=4.0)
     axes.set_axis_off()
-    boxes: dict[str, Box] = {}
+    ends: dict[str, tuple[float, float]] = {}  # of each box: its right edge and its middle
     left, previous = 0.0, None
     for layer in model.layers:
-        kind = type(layer).__name__
-        if layer is model.layers[-1]:
-            kind = "output"
+        kind = "output" if layer is model.layers[-1] else type(layer).__name__
         if kind not in UNET_PARTS:
             continue
         side, channels = layer.output.shape[2:]
         scale = side / model.input_shape[2]
-        width = 0.09 + 0.045 * np.log2(channels)
-        half = 0.175 + 0.525 * scale
-        box = Box(left, left + width, 1.5 * np.log2(scale))
-        bottom, top, center = box.middle - half, box.middle + half, left + width / 2
-        _, color = UNET_PARTS[kind]
-        axes.add_patch(Rectangle((left, bottom), width, 2 * half, color=color, linewidth=0))
-        axes.text(center, top + 0.06, channels, ha="center", va="bottom", fontsize=6)
+        width, half, middle = (
+            0.09 + 0.045 * np.log2(channels),
+            0.175 + 0.525 * scale,
+            1.5 * np.log2(scale),
+        )
+        center, color = left + width / 2, UNET_PARTS[kind][1]
+        axes.add_patch(Rectangle((left, middle - half), width, 2 * half, color=color, linewidth=0))
+        axes.text(center, middle + half + 0.06, channels, ha="center", va="bottom", fontsize=6)
         if kind in ("InputLayer", "MaxPooling2D", "Concatenate"):
-            size = f"{side}x{side}"
-            axes.text(center, bottom - 0.08, size, ha="center", va="top", fontsize=7)
+            below = center, middle - half - 0.08
+            axes.text(*below, f"{side}x{side}", ha="center", va="top", fontsize=7)
         if previous:
-            ends = (previous.right, left), (previous.middle, box.middle)
-            axes.plot(*ends, color="#bbbbbb", linewidth=0.8, zorder=0)
-        if kind == "Concatenate":
-            inputs = [boxes[tensor._keras_history.operation.name] for tensor in layer.input]
-            skipped = min(inputs)  # the one further to the left
-            _arrow(axes, (skipped.right, skipped.middle), (left, box.middle), "#777777")
-        boxes[layer.name] = previous = box
-        left = box.right + 0.32
+            axes.plot(*zip(previous, (left, middle)), color="#bbbbbb", linewidth=0.8, zorder=0)
+        if kind == "Concatenate":  # of the box before it, and one further to the left
+            skipped = min(ends[tensor._keras_history.operation.name] for tensor in layer.input)
+            _arrow(axes, skipped, (left, middle), "#777777")
+        ends[layer.name] = previous = (left + width, middle)
+        left += width + 0.32
     axes.autoscale_view()
     handles: list[Any] = [Patch(color=color, label=text) for text, color in UNET_PARTS.values()]
     handles.append(
@@ -172,16 +157,22 @@ def figure_2_08(poses: np.ndarray, title: str) -> plt.Figure:
     )
     for index, position in enumerate(positions):
         axes.annotate(f"$C_{{{index}}}$", position, 16 * right[index], **FORMULA)
-    for index in range(1, len(poses)):
-        _draw_motion(axes, poses, index)
-    axes.set(
-        xlabel="x, to the right of the first camera (m)", ylabel="z, ahead of the first camera (m)"
-    )
-    axes.set_title(title)
+    motions = np.linalg.inv(poses[:-1]) @ poses[1:]  # Equation 2.3, for T
+    for index, (motion, start, end) in enumerate(zip(motions, positions, positions[1:]), start=1):
+        formula = f"$T_{{{index},{index - 1}}}$"
+        length = np.linalg.norm(motion[:3, 3])
+        _arrow(axes, start, end, RED, shrinkA=3, shrinkB=3, connectionstyle="arc3,rad=-0.3")
+        left = (end - start)[::-1] * (-1, 1)
+        beside, offset = (start + end) / 2 + 0.15 * left, 11 * left / max(length, 1e-9)
+        axes.annotate(formula, beside, offset, color=RED, **FORMULA)
+        axes.plot([], [], " ", label=f"{formula}: {length:.1f} m, {metrics.angles(motion):.1f}°")
     # a square around the path, with room for the formulas
     x, z = (positions.max(axis=0) + positions.min(axis=0)) / 2
     room = 0.65 * max(np.ptp(positions, axis=0).max(), 1)
-    axes.set(xlim=(x - room, x + room), ylim=(z - room, z + room), aspect="equal")
+    axes.set(xlim=(x - room, x + room), ylim=(z - room, z + room), aspect="equal", title=title)
+    axes.set(
+        xlabel="x, to the right of the first camera (m)", ylabel="z, ahead of the first camera (m)"
+    )
     legend = axes.legend(
         title="motion: length, turn",
         loc="center left",
@@ -204,47 +195,31 @@ FORMULA: dict[str, Any] = {
 }
 
 
-def _draw_motion(axes: plt.Axes, poses: np.ndarray, index: int) -> None:
-    """Draw the motion to a pose from the one before it, with its formula, length and angle."""
-    motion = np.linalg.inv(poses[index - 1]) @ poses[index]  # Equation 2.3, for T
-    formula = f"$T_{{{index},{index - 1}}}$"
-    length = np.linalg.norm(motion[:3, 3])
-    start, end = poses[index - 1 : index + 1, [0, 2], 3]
-    _arrow(axes, start, end, RED, shrinkA=3, shrinkB=3, connectionstyle="arc3,rad=-0.3")
-    left = (end - start)[::-1] * (-1, 1)
-    beside = (start + end) / 2 + 0.15 * left
-    offset = 11 * left / max(length, 1e-9)
-    axes.annotate(formula, beside, offset, color=RED, **FORMULA)
-    text = f"{formula}: {length:.1f} m, {metrics.angles(motion):.1f}°"
-    axes.plot([], [], " ", label=text)
-
-
 def figure_2_09(first: np.ndarray, second: np.ndarray, title: str) -> plt.Figure:
     """Figure 2.9: the 60 ORB matches of smallest descriptor distance between two frames.
 
     first, second: (height, width).
     """
     orb = cv2.ORB_create(1000)
-    points, descriptors = orb.detectAndCompute(first, None)
-    second_points, second_descriptors = orb.detectAndCompute(second, None)
+    (points, descriptors), (second_points, second_descriptors) = (
+        orb.detectAndCompute(image, None) for image in (first, second)
+    )
     matcher = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True)
     matches = matcher.match(descriptors, second_descriptors)
     best = sorted(matches, key=lambda match: match.distance)[:60]
     gap = np.full((first.shape[0] // 25, first.shape[1]), 255, np.uint8)
     both = np.vstack([first, gap, second])
-    offset = (0, first.shape[0] + gap.shape[0])
+    down = (0, first.shape[0] + gap.shape[0])
     figure, (axes,) = style.frame_panels(both)
     figure.set_figheight(figure.get_figheight() + 0.55)  # of the colour scale
-    style.show_image(
-        axes, both, f"{title}: the {len(best)} most similar of {len(matches)} ORB matches"
-    )
+    title = f"{title}: the {len(best)} most similar of {len(matches)} ORB matches"
+    style.show_image(axes, both, title)
     ends = [
-        (points[match.queryIdx].pt, np.add(second_points[match.trainIdx].pt, offset))
+        (points[match.queryIdx].pt, np.add(second_points[match.trainIdx].pt, down))
         for match in best
     ]
     distances = [match.distance for match in best]
-    lines = LineCollection(ends, array=distances, cmap="plasma", linewidth=0.8)
-    axes.add_collection(lines)
+    lines = axes.add_collection(LineCollection(ends, array=distances, cmap="plasma", linewidth=0.8))
     figure.colorbar(
         lines,
         ax=axes,
@@ -255,11 +230,6 @@ def figure_2_09(first: np.ndarray, second: np.ndarray, title: str) -> plt.Figure
         label="descriptor bits that differ, of 256",
     )
     return figure
-
-
-def figure_2_10(estimates: dict[str, np.ndarray], true: np.ndarray, title: str) -> plt.Figure:
-    """Figure 2.10: estimated paths, {name: (n, 4, 4)}, and how far each drifts from the truth."""
-    return paths.figure(estimates, true, title)
 
 
 def figure_2_11(
@@ -327,9 +297,7 @@ def show_numbers(
 
     Its background is given colors (h, w, 4) or a color scale whose middle is zero.
     """
-    image = values
-    if colors is not None:
-        image = colors
+    image = values if colors is None else colors
     limit = 2.0 * np.abs(values).max()
     style.show_image(axes, image, title, cmap="PuOr", vmin=-limit, vmax=limit)
     for (row, column), value in np.ndenumerate(values):

@@ -50,15 +50,13 @@ def figure_3_03(
 
     Equation 3.1. image: (h, w) gray or (h, w, 3) RGB.
     """
-    true = label_map == label.id
-    predicted = prediction == label.id
+    true, predicted = label_map == label.id, prediction == label.id
     both = true & predicted
     intersection, union = both.sum(), (true | predicted).sum()
-    iou = intersection / max(union, 1)
     panels = {
         f"label map: {true.sum():,} pixels": {ORANGE: true},
         f"prediction: {predicted.sum():,} pixels": {SKY: predicted},
-        f"IoU = {intersection:,} / {union:,} = {iou:.2f}": {
+        f"IoU = {intersection:,} / {union:,} = {intersection / max(union, 1):.2f}": {
             ORANGE: true,
             SKY: predicted,
             BLUE: both,
@@ -170,22 +168,20 @@ def figure_masks(
     masks: {title: (h, w)}. keypoints: {title: (n, 2)}. true_edges: (h, w), 255 on boundaries, or
     None if unknown.
     """
-    edges = np.zeros_like(frame)
-    if true_edges is not None:
-        edges = dilate(true_edges, 3)
+    edges = np.zeros_like(frame) if true_edges is None else dilate(true_edges, 3)
     pictures = {}
     for title, mask in masks.items():
         shaded = np.where(mask > 0, frame // 2 + 127, frame // 3)
-        pictures[title] = frames.with_edges(shaded, edges)
-    figure = frames.pictures(frame, pictures, keypoints, columns=2)
-    keypoint_color = style.KEYPOINT["color"]
+        pictures[title] = frames.with_edges(shaded, edges), keypoints[title]
+    figure = frames.pictures(frame, pictures, columns=2)
     marks = [
         Patch(facecolor="#bbbbbb", edgecolor="black", label="kept by the mask"),
-        Line2D([], [], linestyle="none", marker="o", color=keypoint_color, label="keypoints on it"),
+        Line2D(
+            [], [], marker="o", color=style.KEYPOINT["color"], ls="none", label="keypoints on it"
+        ),
     ]
     if true_edges is not None:
-        red, green, blue = style.EDGE_COLOR
-        true_color = (red / 255, green / 255, blue / 255)
-        marks.append(Line2D([], [], color=true_color, label="true boundaries of classes"))
+        color = tuple(np.array(style.EDGE_COLOR) / 255)
+        marks.append(Line2D([], [], color=color, label="true boundaries of classes"))
     figure.legend(handles=marks, loc="outside lower center", ncols=3)
     return figure

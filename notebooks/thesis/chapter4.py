@@ -1,13 +1,13 @@
-"""Figures 4.3 to 4.16: single frames, errors in metres, and keypoints.
+"""Figures 4.4 to 4.16: single frames, paths, and errors in metres.
 
 `thesis_repro.report.comparison` shows ratios of errors.
 
-`runs` is the table of `runner.run_jobs`. Lines and bars show the mean over repetitions, or the
-only run.
-Bands and error bars go from the lowest to the highest repetition.
+Runs are rows of the table of `runner.run_jobs`. Lines and bars show the mean over repetitions, or
+the only run. Bands and error bars go from the lowest to the highest repetition.
 """
 
 from functools import partial
+from itertools import compress
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -19,7 +19,6 @@ from matplotlib.patches import Patch
 
 from thesis import frames
 from thesis.flicker import View
-from thesis_repro.odometry.keypoints import spread
 from thesis_repro.report import style
 from thesis_repro.report.style import (
     BASELINE,
@@ -54,20 +53,6 @@ FAILED: dict[str, Any] = {
 }
 
 
-def figure_4_03(
-    frame: np.ndarray, prediction: np.ndarray, title: str, label_map: np.ndarray | None = None
-) -> plt.Figure:
-    """Figure 4.3: a KITTI frame and its predicted label map at the network's size.
-
-    If the true label map is known, it stands below.
-    """
-    label_maps = {"prediction": prediction}
-    if label_map is not None:
-        label_maps["true label map"] = label_map
-    colored = {name: style.label_colors(ids, frame) for name, ids in label_maps.items()}
-    return frames.pictures(frame, {title: frame, **colored}, label_maps=label_maps.values())
-
-
 def figure_4_04(
     frame: np.ndarray, edge_image: np.ndarray, keypoints: np.ndarray, title: str
 ) -> plt.Figure:
@@ -78,67 +63,6 @@ def figure_4_04(
     style.show_image(axes, frames.with_edges(brighter, edge_image), title)
     axes.scatter(*keypoints.T, s=9, color=KEYPOINT["color"], edgecolors="black", linewidths=0.4)
     return figure
-
-
-def figure_4_05(
-    frame: np.ndarray,
-    all_keypoints: np.ndarray,
-    prediction: np.ndarray,
-    mask: np.ndarray,
-    kept_keypoints: np.ndarray,
-    dilation_width: int,
-    title: str,
-) -> plt.Figure:
-    """Figure 4.5: the procedure in five panels.
-
-    They are the frame, all keypoints, the prediction, its dilated edges and the kept keypoints.
-    """
-    all_title = f"(b) all {len(all_keypoints)} Shi-Tomasi keypoints"
-    kept_title = f"(e) the {len(kept_keypoints)} keypoints that the mask keeps"
-    pictures = {
-        f"(a) {title}": frame,
-        all_title: frame,
-        "(c) prediction": style.label_colors(prediction, frame),
-        f"(d) Canny edges dilated by {dilation_width}x{dilation_width}": mask,
-        kept_title: frame,
-    }
-    keypoints = {all_title: all_keypoints, kept_title: kept_keypoints}
-    return frames.pictures(frame, pictures, keypoints, label_maps=[prediction])
-
-
-def figure_overview(
-    frame: np.ndarray,
-    all_keypoints: np.ndarray,
-    mask: np.ndarray,
-    kept_keypoints: np.ndarray,
-    title: str,
-) -> plt.Figure:
-    """Draw all keypoints of a frame, those on its mask, and 200 that are spread over the frame.
-
-    Keypoints are (n, 2) pixels. title: of the frame.
-    """
-    few = spread(200)(frame)
-    all_title = f"{title}: all {len(all_keypoints)} keypoints"
-    kept_title = f"{len(kept_keypoints)} on the mask (light)"
-    spread_title = f"{len(few)} spread over the frame"
-    pictures = {
-        all_title: frame,
-        kept_title: np.where(mask > 0, frame, frame // 3),
-        spread_title: frame,
-    }
-    keypoints = {all_title: all_keypoints, kept_title: kept_keypoints, spread_title: few}
-    figure = frames.pictures(frame, pictures)
-    for panel, points in zip(figure.axes, keypoints.values(), strict=True):
-        # two thousand dots must not merge, and two hundred must be seen
-        size = np.clip(2000 / len(points), 1.2, 8)
-        panel.scatter(*points.T, **{**KEYPOINT, "s": size})
-    return figure
-
-
-def _two_digits(value: float) -> str:
-    """Return a number as text with two digits that are not zero, such as 0.0078."""
-    rounded = float(f"{value:.2g}")
-    return f"{rounded:g}"
 
 
 # around a keypoint of the frame before
@@ -180,6 +104,9 @@ def figure_4_08(views: list[View], title: str) -> plt.Figure:
 
 # by how much errors may be enlarged in a figure of paths
 ENLARGEMENTS = (1, 2, 5, 10, 20, 50, 100)
+# what is special in the runs of a method
+SPECIAL = {"masked": ("dilation_width", ", width {:.0f}")}
+SPECIAL["reduced"] = ("max_keypoints", ", {:.0f} keypoints")
 
 
 def figure_paths(
@@ -195,15 +122,12 @@ def figure_paths(
     positions (n, 3)}. All paths of a sequence, also those of other methods, choose its factor and
     the limits of its panel, so that the figures can be compared.
     """
-    groups = {name: runs.sort_values("repetition") for name, runs in rows.groupby("sequence")}
+    groups = dict(iter(rows.sort_values("repetition").groupby("sequence")))
     columns = min(4, len(groups))
     count = -(-len(groups) // columns)
+    height = count * (PAGE_WIDTH / columns * 0.85 + 1.25) + 0.4
     figure, axes = style.new_figure(
-        2 * count,
-        columns,
-        height=count * (PAGE_WIDTH / columns * 0.85 + 1.25) + 0.4,
-        squeeze=False,
-        height_ratios=[2, 1] * count,
+        2 * count, columns, height=height, squeeze=False, height_ratios=[2, 1] * count
     )
     # panels of a path and of its error
     pairs = list(zip(axes[::2].flat, axes[1::2].flat, strict=True))
@@ -211,27 +135,15 @@ def figure_paths(
         panel.remove()
     errors = compare.spread(rows, "rmse")
     for (above, below), (name, runs) in zip(pairs, groups.items(), strict=False):
-        true = truths[name]
-        above.plot(true[:, 0], true[:, 2], color=TRUTH, linewidth=3, alpha=0.3, label="true path")
-        # paths meet at frame 1, as for the RMSE
-        differences = {
-            run: positions - positions[1] - (true - true[1])
-            for (sequence, run), positions in paths.items()
-            if sequence == name
-        }
-        factor = _enlargement(true, differences)
-        for difference in differences.values():
-            above.update_datalim((true + factor * difference)[:, [0, 2]])
-        _draw_estimates(above, below, true, differences, factor, runs)
-        mean, *span = map(_two_digits, errors.loc[name])
-        if len(runs) > 1:
-            mean += f" ({'-'.join(span)})"
-        enlarged = "errors not enlarged"
-        if factor > 1:
-            enlarged = f"errors x{factor} in the path"
-        above.set_title(f"{name}{_setting(runs)}\n{mean} m\n{enlarged}", fontsize=8)
-        above.set_aspect("equal", adjustable="datalim")
-        below.set_ylim(0, None)
+        of_sequence = {run: path for (sequence, run), path in paths.items() if sequence == name}
+        factor = _draw_paths(above, below, truths[name], of_sequence, runs)
+        # two digits that are not zero, such as 0.0078
+        mean, *span = (f"{value:g}" for value in map(float, map("{:.2g}".format, errors.loc[name])))
+        repeated = f" ({'-'.join(span)})" if len(runs) > 1 else ""
+        enlarged = f"errors x{factor} in the path" if factor > 1 else "errors not enlarged"
+        column, special = SPECIAL.get(runs["method"].iloc[0], ("frames", ""))
+        title = f"{name}{special.format(runs[column].iloc[0])}\n{mean}{repeated} m\n{enlarged}"
+        above.set_title(title, fontsize=8)
         below.set_xlabel("way (m)", fontsize=7.5, labelpad=1)
         for panel in (above, below):
             panel.tick_params(labelsize=6.5)
@@ -240,64 +152,45 @@ def figure_paths(
         above.set_ylabel("z (m) over x (m)", fontsize=7.5)
         below.set_ylabel("distance (m)", fontsize=7.5)
     style.legend_below(figure, [above for above, _ in pairs[: len(groups)]], 4)
-    repeated = ""
-    if rows["repetition"].any():
-        repeated = ", mean (lowest-highest of the repetitions)"
+    repeated = ", mean (lowest-highest of the repetitions)" if rows["repetition"].any() else ""
     figure.suptitle(f"RMSE of each sequence{repeated}", fontsize=9)
     return figure
 
 
-def _enlargement(true: np.ndarray, differences: dict[str, np.ndarray]) -> int:
-    """Return by how much errors are enlarged in a path.
-
-    true: positions (n, 3). differences: {run: (n, 3)}, the errors of all its estimates.
-    """
-    largest = max(np.abs(list(differences.values())).max(), 1e-9)
-    extent = np.ptp(true[:, [0, 2]], axis=0).max()
-    room = max(0.15 * extent / largest, 1)
-    return max(scale for scale in ENLARGEMENTS if scale <= room)
-
-
-def _setting(runs: pd.DataFrame) -> str:
-    """Return what is special in a sequence's runs: the width of the mask or number of keypoints."""
-    run = runs.iloc[0]
-    if run["method"] == "masked":
-        return f", width {run['dilation_width']:.0f}"
-    if run["method"] == "reduced":
-        return f", {run['max_keypoints']:.0f} keypoints"
-    return ""
-
-
-def _draw_estimates(
+def _draw_paths(
     above: plt.Axes,
     below: plt.Axes,
     true: np.ndarray,
-    differences: dict[str, np.ndarray],
-    factor: int,
+    paths: dict[str, np.ndarray],
     runs: pd.DataFrame,
-) -> None:
-    """Draw the estimated paths of a sequence from above, and below their distances to the true one.
+) -> int:
+    """Draw the paths of runs over one sequence from above, and below their distances to the truth.
 
-    true: positions (n, 3). differences: {run: (n, 3)} from it, enlarged by the factor above.
+    true: positions (n, 3). paths: {run: (n, 3)}, also those of other runs. Returns the factor by
+    which errors are enlarged above.
     """
-    steps = np.linalg.norm(np.diff(true, axis=0), axis=1)
-    along = np.concatenate([[0], np.cumsum(steps)])
+    above.plot(true[:, 0], true[:, 2], color=TRUTH, linewidth=3, alpha=0.3, label="true path")
+    # paths meet at frame 1, as for the RMSE
+    errors = {run: path - path[1] - (true - true[1]) for run, path in paths.items()}
+    largest = max(np.abs(list(errors.values())).max(), 1e-9)
+    room = max(0.15 * np.ptp(true[:, [0, 2]], axis=0).max() / largest, 1)
+    factor = max(scale for scale in ENLARGEMENTS if scale <= room)
+    for error in errors.values():
+        above.update_datalim((true + factor * error)[:, [0, 2]])
+    along = np.insert(np.linalg.norm(np.diff(true, axis=0), axis=1).cumsum(), 0, 0)
     for run in runs.itertuples():
-        line: dict[str, Any] = {
-            "color": METHODS[run.method][1],
-            "linewidth": 0.6,
-            "alpha": 0.45,
-            "label": "matched points shuffled",
-        }
+        line: dict[str, Any] = {"linewidth": 0.6, "alpha": 0.45, "label": "matched points shuffled"}
         if run.repetition == 0:
-            line |= {"linewidth": 1.2, "alpha": 1, "label": "estimated path", "zorder": 3}
-        drawn = true + factor * differences[run.run]
-        distance = np.linalg.norm(differences[run.run], axis=1)
-        above.plot(drawn[:, 0], drawn[:, 2], **line)
-        below.plot(along, distance, **line)
-        if run.failed > 0 or run.lost > 0:
-            above.plot(drawn[-1, 0], drawn[-1, 2], **FAILED)
-            below.plot(along[-1], distance[-1], **FAILED)
+            line = {"linewidth": 1.2, "alpha": 1, "label": "estimated path", "zorder": 3}
+        drawn = true + factor * errors[run.run]
+        distance = np.linalg.norm(errors[run.run], axis=1)
+        for panel, across, up in ((above, drawn[:, 0], drawn[:, 2]), (below, along, distance)):
+            panel.plot(across, up, color=METHODS[run.method][1], **line)
+            if run.failed > 0 or run.lost > 0:
+                panel.plot(across[-1], up[-1], **FAILED)
+    above.set_aspect("equal", adjustable="datalim")
+    below.set_ylim(0, None)
+    return factor
 
 
 def figure_against_width(masked: pd.DataFrame, baseline: pd.DataFrame, metric: str) -> plt.Figure:
@@ -314,35 +207,48 @@ def figure_against_width(masked: pd.DataFrame, baseline: pd.DataFrame, metric: s
     figure: Any = plt.figure(figsize=(PAGE_WIDTH, 3.8 + 1.35 * rows), layout="constrained")
     above, below = figure.subfigures(2, 1, height_ratios=[3.2, 1.35 * rows + 0.6])
     axes = above.subplots()
-    by_width = masked.groupby(["sequence", "dilation_width"])[metric].mean()
-    lines = by_width.unstack("sequence")
+    errors = compare.spread(masked, metric, by=["sequence", "dilation_width"])
+    lines = errors["mean"].unstack("sequence")
     lines.plot(ax=axes, style=LINES, markersize=3.5, xticks=lines.index)
-    style.ratio_axis(axes.yaxis, by_width.to_numpy())
+    style.ratio_axis(axes.yaxis, lines.to_numpy())
     axes.legend(loc="upper left", bbox_to_anchor=(1, 1))
     failed = compare.has_failed(masked).groupby([masked["sequence"], masked["dilation_width"]])
-    for (name, width), has_failed in failed.any().items():
-        if has_failed:
-            axes.plot(width, by_width.loc[name, width], **FAILED)
+    crosses = errors["mean"][failed.any()]
+    for (_, width), error in crosses.items():
+        axes.plot(width, error, **FAILED)
     axes.set(
         xlabel="dilation width (pixels)",
         ylabel=label,
         title=f"{metric.upper()} against dilation width, by sequence",
     )
+    of_all = compare.spread(baseline, metric)
     _, panels = frames.small_panels(names, "width (pixels)", below)
     for panel, name in zip(panels, names, strict=True):
-        of_sequence = masked[masked["sequence"] == name]
-        _draw_repetitions(panel, of_sequence, metric)
-        row = compare.spread(baseline[baseline["sequence"] == name], metric).iloc[0]
+        bars, band = errors.loc[name], of_all.loc[name]
+        panel.vlines(
+            bars.index,
+            bars["lowest"],
+            bars["highest"],
+            color=MASKED,
+            alpha=0.35,
+            linewidth=4,
+            label=f"masked, {BAND}",
+        )
+        panel.plot(
+            bars["mean"], "o-", color=MASKED, markersize=2, linewidth=1.1, label="masked, mean"
+        )
+        if name in crosses:
+            panel.plot(crosses[name], **FAILED)
         panel.axhspan(
-            row["lowest"],
-            row["highest"],
+            band["lowest"],
+            band["highest"],
             color=BASELINE,
             alpha=0.2,
             linewidth=0,
             label=f"all keypoints, {BAND}",
         )
         panel.axhline(
-            row["mean"], color=BASELINE, linestyle="--", linewidth=1.1, label="all keypoints, mean"
+            band["mean"], color=BASELINE, linestyle="--", linewidth=1.1, label="all keypoints, mean"
         )
         panel.set_ylim(0, None)
     below.supylabel(label, fontsize=8)
@@ -350,46 +256,9 @@ def figure_against_width(masked: pd.DataFrame, baseline: pd.DataFrame, metric: s
     return figure
 
 
-def _draw_repetitions(panel: plt.Axes, runs: pd.DataFrame, metric: str) -> None:
-    """Draw the errors with masks of one sequence against dilation width."""
-    errors = compare.spread(runs, metric, by="dilation_width")
-    panel.vlines(
-        errors.index,
-        errors["lowest"],
-        errors["highest"],
-        color=MASKED,
-        alpha=0.35,
-        linewidth=4,
-        label=f"masked, {BAND}",
-    )
-    panel.plot(
-        errors["mean"], color=MASKED, marker="o", markersize=2, linewidth=1.1, label="masked, mean"
-    )
-    failed = errors["mean"][compare.has_failed(runs).groupby(runs["dilation_width"]).any()]
-    if len(failed):
-        panel.plot(failed.index, failed, **FAILED)
-
-
-def errors_of_methods(methods: dict[str, pd.DataFrame]) -> pd.DataFrame:
-    """Return the errors of the three METHODS (Figures 4.13 to 4.16), a row a sequence and metric.
-
-    methods: the runs to compare, {one of METHODS: runs}.
-    Columns: metric ("rmse" or "mae"), method (its name in figures), sequence; mean, lowest and
-    highest of the repetitions; failed, whether a run failed.
-    """
-    tables = []
-    for method, rows in methods.items():
-        failed = compare.has_failed(rows).groupby(rows["sequence"]).any()
-        for metric in ("rmse", "mae"):
-            spread = compare.spread(rows, metric).assign(failed=failed).reset_index()
-            tables.append(spread.assign(metric=metric, method=METHODS[method][0]))
-    return pd.concat(tables, ignore_index=True)
-
-
 def mark_failed(axes: plt.Axes, failed: pd.DataFrame) -> None:
     """Mark bars that stand for a failed run by a cross. failed: the shape of the table drawn."""
     methods = [bars for bars in axes.containers if isinstance(bars, BarContainer)]
     for bars, name in zip(methods, failed, strict=True):
-        for bar, has_failed in zip(bars, failed[name], strict=True):
-            if has_failed is True:
-                axes.plot(bar.get_x() + bar.get_width() / 2, bar.get_height(), **FAILED)
+        for bar in compress(bars, failed[name].eq(True)):
+            axes.plot(bar.get_x() + bar.get_width() / 2, bar.get_height(), **FAILED)

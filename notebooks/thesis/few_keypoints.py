@@ -31,22 +31,21 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from thesis.ablations import FunctionMasks, random_keypoints
+from thesis.ablations import FunctionMasks, random_keypoints, run_choices
 from thesis_repro import odometry
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.mask_files import LabelMasks
 from thesis_repro.odometry import THESIS
 from thesis_repro.odometry.keypoints import filled, spread
 from thesis_repro.report import style, texts
-from thesis_repro.running import results
+from thesis_repro.running import provenance
 from thesis_repro.study import compare, jobs
-from thesis_repro.study.jobs import CONTROL_WIDTH, Job
-from thesis_repro.study.runner import Run, run_all
+from thesis_repro.study.jobs import CONTROL_WIDTH
 from thesis_repro.study.worth import FILL
 
 ESTIMATORS = {name: jobs.ESTIMATORS[name] for name in ("thesis", "refined")}  # of rule 4
 NUMBERS = (50, 100, 200, 400, 800)
-SEEDS = (None, 1, 2, 3)  # of the shuffles
+REPETITIONS = 4  # three of them with the matched points shuffled
 TIMED_RUNS = 5
 LABELS = {
     "all": "all keypoints",
@@ -56,6 +55,7 @@ LABELS = {
     "mask": "the strongest on the mask",
     "filled": f"mask, filled to {FILL} a field",
 }
+ERRORS = compare.JUDGING_METRICS
 COLUMNS = (
     "sequence",
     "choice",
@@ -82,10 +82,12 @@ def choices(sequence: Sequence, labels: Path) -> dict[tuple[str, int], tuple]:
     for number in NUMBERS:
         few = replace(THESIS, max_keypoints=number)
         drawn = FunctionMasks(partial(random_keypoints, sequence, number))
-        chosen["strongest", number] = few, None
-        chosen["random", number] = THESIS, drawn
-        chosen["spread", number] = replace(THESIS, detector=spread(number)), None
-        chosen["mask", number] = few, masks
+        chosen |= {
+            ("strongest", number): (few, None),
+            ("random", number): (THESIS, drawn),
+            ("spread", number): (replace(THESIS, detector=spread(number)), None),
+            ("mask", number): (few, masks),
+        }
     return chosen
 
 
@@ -94,31 +96,20 @@ def measure(
     labels: Path,
     folder: Path,
     processes: int = 1,
-    seeds: Iterable[int | None] = SEEDS,
+    repetitions: int = REPETITIONS,
 ) -> pd.DataFrame:
     """Run all choices on sequences. Returns one row a run; finished sequences are not repeated.
 
-    labels: a folder with one folder of label maps a sequence. folder: of the results. seeds: that
-    shuffle the matched points, one run each; None leaves their order.
+    labels: a folder with one folder of label maps a sequence. folder: of the results.
     """
-    runs: dict[Job, Run] = {}
-    made_from = {}
-    for sequence in sequences:
-        maps = labels / sequence.name
-        made_from[sequence.name] = {
-            "choices": results.digest_of_file(__file__),
-            "labels": results.digest_of_files(sorted(maps.glob("*.png"))),
-        }
-        for (choice, number), (settings, masks) in choices(sequence, labels).items():
-            for estimator, seed in product(ESTIMATORS, seeds):
-                job = Job(
-                    sequence.name,
-                    f"{choice}-{number}",
-                    estimator=estimator,
-                    repetition=seed or 0,
-                )
-                runs[job] = sequence, job.changed(settings), masks
-    table = run_all(runs, folder, made_from=made_from, processes=processes).table
+
+    def named(sequence: Sequence) -> dict[str, tuple]:
+        of_sequence = choices(sequence, labels).items()
+        return {f"{choice}-{number}": run for (choice, number), run in of_sequence}
+
+    table = run_choices(
+        named, sequences, labels, folder, __file__, ESTIMATORS, repetitions, processes
+    )
     chosen = table["method"].str.rpartition("-")
     return table.assign(
         choice=chosen[0],
@@ -142,48 +133,44 @@ def time_steps(sequence: Sequence, labels: Path, folder: Path, frames: int = 40)
     cv2.setNumThreads(1)
     excerpt = sequence.subset(frames)
     timed = {key: run for key, run in choices(excerpt, labels).items() if key[0] != "random"}
-    seconds: dict[tuple[str, int], list[float]] = {key: [] for key in timed}
-    for _ in range(TIMED_RUNS):
-        for key, (settings, masks) in timed.items():
-            start = process_time()
-            odometry.run(excerpt, settings, masks)
-            seconds[key].append(process_time() - start)
-    # whole ones: repeated measurements differ by more than a millisecond
-    rows = [
-        {"choice": choice, "number": number, "milliseconds": round(1000 * least / len(excerpt))}
-        for (choice, number), least in ((key, min(runs)) for key, runs in seconds.items())
-    ]
-    times = pd.DataFrame(rows)
-    results.write_table(file, times)
+    least = dict.fromkeys(timed, np.inf)
+    for _, (key, (settings, masks)) in product(range(TIMED_RUNS), timed.items()):
+        start = process_time()
+        odometry.run(excerpt, settings, masks)
+        least[key] = min(least[key], process_time() - start)
+    # whole milliseconds: repeated measurements differ by more than one
+    times = (1000 * pd.Series(least) / len(excerpt)).round().astype(int)
+    times = times.rename_axis(["choice", "number"]).rename("milliseconds").reset_index()
+    provenance.write_table(file, times)
     return times
 
 
 def table(runs: pd.DataFrame) -> pd.DataFrame:
     """Return one row a choice, number, estimator and error: its ratio to all keypoints.
 
-    runs: of `measure`. low, high: 95 %. as_good: whether the 90 % interval is within MARGINS.
-    no_worse: whether its upper end is.
+    runs: of `measure`. low, high: 95 %. as_good: whether the 90 % interval is within MARGINS, and
+    no more runs failed than with all keypoints (rule 4). no_worse: the same of its upper end
+    (rule 5).
     """
     rows = []
-    for estimator in ESTIMATORS:
-        of_estimator = runs[runs["estimator"] == estimator]
-        reference = of_estimator[of_estimator["choice"] == "all"]
-        for (choice, number), chosen in of_estimator.groupby(["choice", "number"], sort=False):
-            for error, margin in MARGINS.items():
-                ratios = compare.ratios(chosen, reference, error)
-                numbers = compare.typical_ratio(ratios)
-                row = {
-                    "choice": choice,
-                    "number": number,
-                    "keypoints": chosen["keypoints"].mean(),
-                    "estimator": estimator,
-                    "error": error,
-                    **{name: numbers[name] for name in ("ratio", "low", "high", "n", "above")},
-                    "failed": int(chosen["failed"].sum()),
-                    "runs": len(chosen),
-                    **within(ratios, margin),
-                }
-                rows.append(row)
+    keys = ["choice", "number", "estimator"]
+    for (choice, number, estimator), chosen in runs.groupby(keys, sort=False):
+        reference = runs[(runs["choice"] == "all") & (runs["estimator"] == estimator)]
+        no_more_failed = chosen["failed"].sum() <= reference["failed"].sum()
+        for error, margin in MARGINS.items():
+            ratios = compare.ratios(chosen, reference, error)
+            numbers = compare.typical_ratio(ratios)
+            row = {
+                "choice": choice,
+                "number": number,
+                "keypoints": chosen["keypoints"].mean(),
+                "estimator": estimator,
+                "error": error,
+                **{name: numbers[name] for name in ("ratio", "low", "high", "n", "above")},
+                "failed": f"{chosen['failed'].sum()} of {len(chosen)}",
+                **{rule: no_more_failed and good for rule, good in within(ratios, margin).items()},
+            }
+            rows.append(row)
     return pd.DataFrame(rows)
 
 
@@ -195,39 +182,31 @@ def within(ratios: pd.Series, margin: float) -> dict[str, bool]:
 
 
 def summary(rows: pd.DataFrame, times: pd.DataFrame | None = None) -> pd.DataFrame:
-    """Return one row a choice and number, for readers. rows: of `table`; times: `time_steps`."""
+    """Return one row a choice and number, for readers. rows: of `table`; times: `time_steps`.
+
+    "as good" and "no worse" are "yes" if a rule holds for both errors and both estimators.
+    """
+    keys = ["choice", "number"]
+    milliseconds = {} if times is None else times.set_index(keys)["milliseconds"]
     lines = []
-    milliseconds = pd.Series(dtype=float)
-    if times is not None:
-        milliseconds = times.set_index(["choice", "number"])["milliseconds"]
-    for (choice, number), chosen in rows.groupby(["choice", "number"], sort=False):
+    for (choice, number), chosen in rows.groupby(keys, sort=False):
         line: dict[str, Any] = {
             "keypoints": f"{chosen['keypoints'].iloc[0]:.0f}",
             "how chosen": LABELS[choice],
         }
         for row in chosen.itertuples():
-            name = f"{compare.METRICS[row.error]}, {ESTIMATORS[row.estimator]}"
             ratio, low, high = map(texts.number, (row.ratio, row.low, row.high))
+            name = f"{ERRORS[row.error]}, {ESTIMATORS[row.estimator]}"
             line[name] = f"{ratio} ({low}-{high}), {row.above} of {row.n}"
-        for estimator, of_estimator in chosen.groupby("estimator", sort=False):
-            failed, runs = of_estimator[["failed", "runs"]].iloc[0]
-            line[f"failed, {ESTIMATORS[estimator]}"] = f"{failed} of {runs}"
+        for row in chosen.drop_duplicates("estimator").itertuples():
+            line[f"failed, {ESTIMATORS[row.estimator]}"] = row.failed
         if times is not None:
             line["CPU time a frame (ms)"] = milliseconds.get((choice, number))
-        line["as good"] = _answer(rows, choice, number, "as_good")
-        line["no worse"] = _answer(rows, choice, number, "no_worse")
+        for rule in ("as_good", "no_worse"):
+            is_so = choice != "all" and chosen[rule].all()
+            line[rule.replace("_", " ")] = "yes" if is_so else ""
         lines.append(line)
     return pd.DataFrame(lines)
-
-
-def _answer(rows: pd.DataFrame, choice: str, number: int, rule: str) -> str:
-    """Return "yes" if a rule, a column of `table`, holds for both errors and both estimators."""
-    chosen = rows[(rows["choice"] == choice) & (rows["number"] == number)]
-    reference = rows[rows["choice"] == "all"].set_index(["estimator", "error"])["failed"]
-    failed = chosen.set_index(["estimator", "error"])["failed"]
-    if choice != "all" and chosen[rule].all() and (failed <= reference).all():
-        return "yes"
-    return ""
 
 
 def figure(rows: pd.DataFrame, times: pd.DataFrame | None = None) -> Figure:
@@ -237,11 +216,11 @@ def figure(rows: pd.DataFrame, times: pd.DataFrame | None = None) -> Figure:
     `table`. times: of `time_steps`, drawn below the errors if given.
     """
     more = times is not None
-    scales = [(error, near) for error in MARGINS for near in (False, True)]
+    scales = list(product(ERRORS, (False, True)))
     drawing, panels = style.new_figure(
         len(scales) + more, len(ESTIMATORS), sharex=True, height=9 + 1.6 * more
     )
-    for panel_row, (error, near) in zip(panels, scales, strict=False):
+    for (error, near), panel_row in zip(scales, panels, strict=False):
         for panel, estimator in zip(panel_row, ESTIMATORS, strict=True):
             shown = rows[(rows["error"] == error) & (rows["estimator"] == estimator)]
             _draw_curves(panel, shown, near)
@@ -252,8 +231,7 @@ def figure(rows: pd.DataFrame, times: pd.DataFrame | None = None) -> Figure:
         panel_row[0].set_ylabel("ratio to all keypoints")
     if times is not None:
         numbers = rows.drop_duplicates(["choice", "number"])[["choice", "number", "keypoints"]]
-        timed = times.merge(numbers, on=["choice", "number"])
-        _draw_times(panels[-1, 0], timed)
+        _draw_times(panels[-1, 0], times.merge(numbers, on=["choice", "number"]))
         panels[-1, 1].axis("off")
     for panel in (panels[-1, 0], panels[len(scales) - 1, -1]):
         panel.set_xlabel("keypoints a frame")
@@ -267,32 +245,27 @@ def _draw_times(panel: plt.Axes, timed: pd.DataFrame) -> None:
         of_choice = timed[timed["choice"] == choice].sort_values("keypoints")
         look = style.line_style(index)
         panel.plot(of_choice["keypoints"], of_choice["milliseconds"], marker="o", **look)
-        if choice == "all":
-            (place,) = of_choice[["keypoints", "milliseconds"]].to_numpy()
-            panel.annotate("all", place, (-8, 0), textcoords="offset points", ha="right")
+    (place,) = timed.loc[timed["choice"] == "all", ["keypoints", "milliseconds"]].to_numpy()
+    panel.annotate("all", place, (-8, 0), textcoords="offset points", ha="right")
     panel.set_ylabel("CPU time a frame (ms)")
     panel.set_ylim(0)
 
 
 def _draw_curves(panel: plt.Axes, rows: pd.DataFrame, near: bool) -> None:
     panel.axhline(1, color=style.GRAY, linewidth=0.8)
-    for index, (choice, label) in enumerate(LABELS.items()):
+    for index, (choice, label) in list(enumerate(LABELS.items()))[1:]:  # all keypoints are the 1
         of_choice = rows[rows["choice"] == choice].sort_values("keypoints")
-        if choice == "all":
-            continue
         look = style.line_style(index)
+        color = look["color"]
         position = of_choice["keypoints"] * 1.03 ** (index - 3)  # side by side
         panel.plot(position, of_choice["ratio"], marker="o", markersize=4, label=label, **look)
-        panel.vlines(
-            position, of_choice["low"], of_choice["high"], color=look["color"], linewidth=0.9
-        )
+        panel.vlines(position, of_choice["low"], of_choice["high"], color=color, linewidth=0.9)
         if near:
+            cut = of_choice["low"] < NEAR[0], of_choice["high"] > NEAR[1]
             inside = of_choice["ratio"].between(*NEAR)
-            cut_low, cut_high = inside & (of_choice["low"] < NEAR[0]), of_choice["high"] > NEAR[1]
-            for edge, marker, cut in zip(NEAR, "v^", (cut_low, inside & cut_high), strict=True):
-                for place in position[cut]:
-                    mark: dict[str, Any] = {"color": look["color"], "markersize": 4}
-                    panel.plot(place, edge, marker, clip_on=False, **mark)
+            for edge, marker, is_cut in zip(NEAR, "v^", cut, strict=True):
+                for place in position[inside & is_cut]:
+                    panel.plot(place, edge, marker, clip_on=False, color=color, markersize=4)
     if near:
         panel.set_ylim(*NEAR)
     panel.set_xscale("log")

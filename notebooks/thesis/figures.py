@@ -9,7 +9,7 @@ import subprocess
 import sys
 
 from thesis import page, trainings
-from thesis_repro.running import messages, results
+from thesis_repro.running import program, provenance
 from thesis_repro.running.settings import ROOT, Settings, read_settings
 
 
@@ -21,11 +21,11 @@ def main() -> int:
     """
     settings = read_settings()
     if settings.figures_in_git and platform.machine() not in ("x86_64", "AMD64"):
-        messages.log.warning(
+        program.log.warning(
             f"figures: those in git are from an x86 processor; on {platform.machine()} some numbers "
             "will differ; FIGURES=/path keeps both"
         )
-    with results.claimed(settings.build / "notebooks"):
+    with provenance.claimed(settings.build / "notebooks"):
         status = _execute(settings)
         page.update(settings, settings.published)
     if note := trainings.network_note(settings):
@@ -51,4 +51,4 @@ def _execute(settings: Settings) -> int:
 
 
 if __name__ == "__main__":
-    messages.run_main(main)
+    program.run_main(main)

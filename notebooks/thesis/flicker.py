@@ -10,7 +10,7 @@ import numpy as np
 
 from thesis_repro import masks
 from thesis_repro.odometry import THESIS
-from thesis_repro.odometry.odometry import detect, track
+from thesis_repro.odometry.loop import detect, track
 
 SAME = 2.0  # pixels: a keypoint within this distance of a tracked keypoint is the same one
 
@@ -48,11 +48,9 @@ def follow_window(
         detect(frame, THESIS, masks.dilate(edge_image, dilation_width))
         for frame, edge_image in zip(frames, edge_images, strict=True)
     ]
-    center = size / 2
     tracked, followed = _track(frames[0], frames[1], points[0])
     jumping = points[0][followed & _far(tracked, points[1])]
-    if len(jumping):
-        center = _densest(jumping, half)
+    center = _densest(jumping, half) if len(jumping) else size / 2
     views: list[View] = []
     in_window = expected = np.zeros((0, 2), np.float32)
     for index, (frame, edge_image) in enumerate(zip(frames, edge_images, strict=True)):
@@ -67,13 +65,9 @@ def follow_window(
         in_window = _inside(points[index], low, high)
         expected = _inside(expected, low, high)
         jumped = int(_far(expected, points[index]).sum())
-        shown_expected = None
-        if index:
-            shown_expected = expected - low
-        view = View(
-            first + index, frame[crop], edge_image[crop], in_window - low, shown_expected, jumped
-        )
-        views.append(view)
+        shown = expected - low if index else None
+        keypoints = in_window - low
+        views.append(View(first + index, frame[crop], edge_image[crop], keypoints, shown, jumped))
     return views
 
 

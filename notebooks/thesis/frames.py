@@ -14,20 +14,21 @@ from thesis_repro.report.style import GREEN, RED
 
 def pictures(
     frame: np.ndarray,
-    pictures: dict[str, np.ndarray],
-    keypoints: dict[str, np.ndarray] | None = None,
+    pictures: dict[str, Any],
     columns: int = 1,
     label_maps: Collection[np.ndarray] = (),
 ) -> plt.Figure:
     """Show pictures {title: picture} of a frame's shape.
 
-    keypoints: {title: (n, 2)}, shown on the picture. label_maps: of the classes in a legend.
+    A picture may be a pair, with keypoints (n, 2) on it. label_maps: of the classes in a legend.
     """
     figure, axes = style.frame_panels(frame, -(-len(pictures) // columns), columns)
-    for panel, (title, picture) in zip(axes, pictures.items()):
+    for panel, (title, shown) in zip(axes, pictures.items()):
+        picture, points = shown if isinstance(shown, tuple) else (shown, np.empty((0, 2)))
         style.show_image(panel, picture, title)
-        if keypoints and title in keypoints:
-            panel.scatter(*keypoints[title].T, **style.KEYPOINT)
+        # two thousand dots must not merge, and two hundred must be seen
+        size = np.clip(2000 / max(len(points), 1), 1.2, 8)
+        panel.scatter(*points.T, **{**style.KEYPOINT, "s": size})
     for panel in axes[len(pictures) :]:
         panel.set_axis_off()
     if label_maps:
@@ -57,11 +58,11 @@ def small_panels(
     panels = list(figure.subplots(rows, columns, squeeze=False).flat)
     for panel in panels[len(names) :]:
         panel.remove()
-    for panel, name in zip(panels, names, strict=False):
+    panels = panels[: len(names)]
+    for panel, name in zip(panels, names, strict=True):
         panel.set_title(name, fontsize=8, pad=3)
         panel.tick_params(labelsize=7)
         panel.xaxis.set_major_locator(MaxNLocator(4, integer=True))
-    panels = panels[: len(names)]
     for panel in panels[-columns:]:
         panel.set_xlabel(xlabel, fontsize=8)
     return figure, panels
@@ -78,26 +79,6 @@ def gradients(enlarged: np.ndarray, strength: np.ndarray, edge_image: np.ndarray
     return figure
 
 
-def mask_and_keypoints(
-    frame: np.ndarray, edge_image: np.ndarray, mask: np.ndarray, keypoints: np.ndarray, title: str
-) -> plt.Figure:
-    """Draw the edges, the mask and the keypoints (n, 2) of a frame. title: of the edges."""
-    kept = f"{len(keypoints)} keypoints on the mask"
-    panels = {
-        f"{title}, drawn wider": dilate(edge_image, 5),
-        f"mask: {100 * (mask > 0).mean():.1f} % of the frame": mask,
-        kept: frame,
-    }
-    return pictures(frame, panels, {kept: keypoints})
-
-
-def corners(frame: np.ndarray, strength: np.ndarray, points: np.ndarray, title: str) -> plt.Figure:
-    """Draw the strength of a corner at each pixel (h, w), and the keypoints (n, 2)."""
-    logarithm = np.log(strength + strength.max() / 1e4)
-    panels = {"R of every pixel (logarithm)": logarithm, title: frame}
-    return pictures(frame, panels, {title: points})
-
-
 def tracks(
     frame: np.ndarray,
     old: np.ndarray,
@@ -111,8 +92,7 @@ def tracks(
     """
     figure, (axis,) = style.frame_panels(frame)
     style.show_image(axis, frame, title)
-    if inliers is None:
-        inliers = np.ones(len(old), bool)
+    inliers = np.ones(len(old), bool) if inliers is None else inliers
     for chosen, color in ((inliers, GREEN), (~inliers, RED)):
         ends = np.stack([old[chosen], new[chosen]], axis=1)
         axis.plot(*ends.transpose(2, 1, 0), color=color, linewidth=0.7)

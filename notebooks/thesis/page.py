@@ -18,11 +18,12 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
+import pandas as pd
 from markupsafe import Markup
 
-from thesis import captions, section_4_2, tables
-from thesis_repro.report import page, texts
-from thesis_repro.running import messages, results
+from thesis import captions, timing
+from thesis_repro.report import html, texts
+from thesis_repro.running import program, provenance
 from thesis_repro.running.files import atomic, listed, write_text
 from thesis_repro.running.settings import ROOT, Settings, read_settings
 
@@ -39,17 +40,17 @@ def update(settings: Settings, folder: Path) -> None:
     Converts each executed notebook that is newer than its HTML. Deletes temporary files of killed
     runs. Raises InputError if another run uses the folder.
     """
-    with results.claimed(settings.build / "notebooks"):
-        results.sweep(settings.build)
+    with provenance.claimed(settings.build / "notebooks"):
+        provenance.sweep(settings.build)
         if folder.is_dir():
-            results.sweep(folder)
+            provenance.sweep(folder)
         _copy(settings, folder)
         settings = replace(settings, figures=folder)
         for path in _executed(settings):
-            html = path.with_suffix(".html")
-            if not html.is_file() or html.stat().st_mtime < path.stat().st_mtime:
-                write_text(html, notebook_html(path, folder / page.PAGE))
-        write_text(folder / page.PAGE, build(settings))
+            converted = path.with_suffix(".html")
+            if not converted.is_file() or converted.stat().st_mtime < path.stat().st_mtime:
+                write_text(converted, notebook_html(path, folder / html.PAGE))
+        write_text(folder / html.PAGE, build(settings))
         write_text(folder / GALLERY, gallery(settings))
 
 
@@ -117,15 +118,11 @@ def _of_real_frames(settings: Settings) -> list[dict[str, Any]]:
     """Return the described artefacts of the evidence on real frames that is in git."""
     real = replace(settings, figures=settings.figures / REAL, kitti_is_embedded=False)
     numbers = beside_the_thesis(real)
-
-    def added(*names: str) -> list[dict[str, Any]]:
-        return [artefact for artefact in captions.ADDED if artefact["name"] in names]
-
-    chapter = [
-        *added("few_keypoints"),
-        *captions.CHAPTERS["Chapter 4: results"],
-        *added("comparison", "widths"),
-    ]
+    few, others = (
+        [artefact for artefact in captions.ADDED if artefact["name"] in names]
+        for names in (["few_keypoints"], ["comparison", "widths"])
+    )
+    chapter = [*few, *captions.CHAPTERS["Chapter 4: results"], *others]
     described = [_describe(artefact, real, numbers) for artefact in chapter]
     for artefact in described:
         artefact["id"] = f"real-{artefact['id']}"
@@ -137,26 +134,18 @@ def _of_real_frames(settings: Settings) -> list[dict[str, Any]]:
 def build(settings: Settings) -> str:
     """Return the page of a run as HTML, made from the files in its folders."""
     chapters = _chapters(settings)
-    of_run = [described for title, described in chapters.items() if title != REAL_CHAPTER]
+    of_run = [artefacts for title, artefacts in chapters.items() if title != REAL_CHAPTER]
     artefacts = list(itertools.chain(*of_run))
     of_thesis = [artefact for artefact in artefacts if artefact["number"] is not None]
-    missing = [
-        artefact for artefact in artefacts if not (artefact["there"] or artefact["left_out"])
-    ]
-    notebooks = {}
-    made = page.made_with()
-    if not settings.figures_in_git:  # a clone has no executed notebooks
-        made |= page.made_on()
-        executed = _executed(settings)
-        for path in executed:
-            notebooks[path.stem] = os.path.relpath(path.with_suffix(".html"), settings.figures)
-        if executed:
-            latest = max(path.stat().st_mtime for path in executed)
-            made["day"] = f"{datetime.fromtimestamp(latest, UTC):%d %B %Y}"
     docs = _links_to_documents(settings)
-    answer = None
-    if docs and settings.figures_in_git:
-        answer = _answer(docs)
+    answer = _answer(docs) if docs and settings.figures_in_git else None
+    executed, made = [], html.made_with()
+    if not settings.figures_in_git:  # a clone has no executed notebooks
+        executed, made = _executed(settings), made | html.made_on()
+    if executed:
+        latest = max(path.stat().st_mtime for path in executed)
+        made["day"] = f"{datetime.fromtimestamp(latest, UTC):%d %B %Y}"
+    links = [os.path.relpath(path.with_suffix(".html"), settings.figures) for path in executed]
     return texts.render(
         "page.html.j2",
         title=f"Keypoint masks, {settings.run}",
@@ -165,10 +154,10 @@ def build(settings: Settings) -> str:
         shown=sum(artefact["there"] for artefact in of_thesis),
         of=len(captions.THESIS),
         card=captions.CARD,
-        missing=missing,
+        missing=[each for each in artefacts if not (each["there"] or each["left_out"])],
         docs=docs,
         lead=answer,
-        notebooks=notebooks,
+        notebooks={path.stem: link for path, link in zip(executed, links)},
         folder=os.path.relpath(settings.build / "notebooks", settings.figures),
         made=made,
     )
@@ -177,7 +166,7 @@ def build(settings: Settings) -> str:
 def gallery(settings: Settings) -> str:
     """Return the gallery of a run as Markdown, made from the files in its folders."""
     chapters = _chapters(settings)
-    return texts.render("gallery.md.j2", settings=settings, chapters=chapters, page=page.PAGE)
+    return texts.render("gallery.md.j2", settings=settings, chapters=chapters, page=html.PAGE)
 
 
 def _links_to_documents(settings: Settings) -> str | None:
@@ -191,7 +180,7 @@ def _answer(docs: str) -> Markup:
     """Return the answer and what to do of docs/answer.md. docs: the way to that folder."""
     text = (ROOT / "docs" / "answer.md").read_text(encoding="utf-8")
     answer, to_do = (part.partition("\n\n")[2] for part in text.split("\n\n## ")[:2])
-    return texts.html(re.sub(r"\]\((?!\w+:|#)", f"]({docs}/", f"{answer}\n\n{to_do}"))
+    return html.from_markdown(re.sub(r"\]\((?!\w+:|#)", f"]({docs}/", f"{answer}\n\n{to_do}"))
 
 
 def _describe(
@@ -201,8 +190,8 @@ def _describe(
 
     numbers: of the run, from `beside_the_thesis`.
     """
-    name = artefact["name"]
-    described = page.describe(settings.figures, artefact)
+    name, needs = artefact["name"], artefact.get("needs")
+    described = html.describe(settings.figures, artefact)
     if name in captions.THESIS:
         # figure_4_07 is Figure 4.7, figure_a_01 is Figure A.1
         _, chapter, count = name.split("_")
@@ -212,14 +201,16 @@ def _describe(
     described["makers"] = [
         notebook for notebook, names in captions.MADE_BY.items() if name in names
     ]
-    if described["thesis"]:
-        described["thesis"] = _of_thesis(described["thesis"], settings, numbers.get(name))
-    if not described["there"] and _is_left_out(artefact, settings):
-        described["left_out"] = artefact["needs"]
+    if thesis := described["thesis"]:
+        described["thesis"] = thesis | _beside(thesis, settings, numbers.get(name))
+    # a run on real frames does not make what needs a variable that is not set
+    is_given = needs == "KITTI_SEMANTIC" and settings.kitti_semantic
+    if needs and settings.uses_shipped_model and not (described["there"] or is_given):
+        described["left_out"] = needs
     return described
 
 
-def _of_thesis(
+def _beside(
     thesis: dict[str, Any], settings: Settings, numbers: dict[str, Any] | None
 ) -> dict[str, Any]:
     """Return what the thesis reports beside an artefact and what this run gives, as texts.
@@ -227,26 +218,12 @@ def _of_thesis(
     thesis: the templates, see `captions`. numbers: of this run, or None if it has none.
     """
     fill = texts.TEMPLATES.from_string
-    here: Any = False
-    if numbers is not None:
-        here = fill(thesis["here"]).render(numbers)
-    is_embedded = {
-        "runs": settings.kitti_is_embedded,
-        "training": settings.cityscapes_is_embedded,
-    }
-    return thesis | {
+    embedded = {"runs": settings.kitti_is_embedded, "training": settings.cityscapes_is_embedded}
+    return {
         "text": fill(thesis["text"]).render(captions.REPORTED),
-        "here": here,
-        "embedded": is_embedded.get(thesis["data"], False),
+        "here": numbers is not None and fill(thesis["here"]).render(numbers),
+        "embedded": embedded.get(thesis["data"], False),
     }
-
-
-def _is_left_out(artefact: dict[str, Any], settings: Settings) -> bool:
-    """Return whether a run does not make an artefact, since a variable that it needs is not set."""
-    needs = artefact.get("needs")
-    if not needs or not settings.uses_shipped_model:
-        return False
-    return needs != "KITTI_SEMANTIC" or not settings.kitti_semantic
 
 
 def beside_the_thesis(settings: Settings) -> dict[str, Any]:
@@ -255,31 +232,31 @@ def beside_the_thesis(settings: Settings) -> dict[str, Any]:
     Their form is {name of the artefact: numbers}. A name is missing if its file was not written.
     """
     numbers: dict[str, Any] = {}
-    history = tables.read(settings.figures / "figure_4_01.csv")
+    history = _table(settings.figures / "figure_4_01.csv")
     if len(history):
-        best = history.loc[history["val_loss"].idxmin()]
-        last = history.iloc[-1]
-        numbers["figure_4_01"] = {
-            "epochs": len(history),
-            "best": best.to_dict(),
-            "last": last.to_dict(),
-        }
-    chosen = tables.read(settings.figures / "table_4_1.csv")
+        best, last = history.loc[history["val_loss"].idxmin()], history.iloc[-1]
+        numbers["figure_4_01"] = {"epochs": len(history), "best": dict(best), "last": dict(last)}
+    chosen = _table(settings.figures / "table_4_1.csv")
     if "mean keypoints" in chosen:
         numbers["figure_4_07"] = {"keypoints": chosen["mean keypoints"].clip(lower=1)}
-    seconds = tables.read(settings.figures / "timings" / "seconds.csv")
+    seconds = _table(settings.figures / "timings" / "seconds.csv")
     if len(seconds):
-        numbers["figure_4_17"] = {"saved": 0 - section_4_2.time_savings(seconds)}
+        numbers["figure_4_17"] = {"saved": 0 - timing.time_savings(seconds)}
     return numbers
+
+
+def _table(path: Path) -> pd.DataFrame:
+    """Return a CSV file as a table; an empty one if there is no such file."""
+    return pd.read_csv(path).convert_dtypes() if path.is_file() else pd.DataFrame()
 
 
 def main() -> None:
     """Write the page and the gallery anew from the figures in git."""
     settings = read_settings()
     settings = replace(settings, figures=settings.published)
-    write_text(settings.figures / page.PAGE, build(settings))
+    write_text(settings.figures / html.PAGE, build(settings))
     write_text(settings.figures / GALLERY, gallery(settings))
 
 
 if __name__ == "__main__":
-    messages.run_main(main)
+    program.run_main(main)

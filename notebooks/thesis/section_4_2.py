@@ -2,12 +2,17 @@
 
 The choice of a width is in `study.best_width`; all other comparisons are in `study.compare`. A
 change is Equation 4.1 of means over the repetitions, in percent; negative is better. `masked` and
-`baseline` are the runs with masks and with all keypoints, from `compare.of_method`.
+`baseline` are the runs with masks of each width and with all keypoints, from `compare.of_method`.
+`shuffled` are runs with all keypoints, many repetitions. A metric is "rmse" or "mae".
 """
+
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
+from thesis.captions import REPORTED
+from thesis_repro.study import compare
 from thesis_repro.study.best_width import (
     best_widths,
     changes,
@@ -16,8 +21,8 @@ from thesis_repro.study.best_width import (
     percent_change,
     stability,
 )
-from thesis_repro.study.compare import LEVEL
 from thesis_repro.study.jobs import Job, repeated
+from thesis_repro.study.methods import AS_SLAM_SYSTEMS
 
 __all__ = [
     "best_widths",
@@ -25,15 +30,33 @@ __all__ = [
     "changes_of_repetition",
     "chosen_widths",
     "independent_widths",
+    "is_decisive",
     "middle",
     "null_distribution",
     "of_chosen_width",
     "percent_change",
+    "procedure",
     "reduced_jobs",
     "stability",
-    "time_savings",
+    "table_4_1",
+    "table_of_change",
 ]
 STUDIES = 4000  # simulated ones
+SINGLE = "change (%), one run each"
+NULL = "change (%), one run each, if masks did nothing"
+
+
+def is_decisive(job: Job, tested: int) -> bool:
+    """Return whether a run is made in the embedded world, where no conclusion rests on the others.
+
+    Each job is run once. Section 4.2 compares all keypoints, masks of the `tested` width and
+    plainly reduced keypoints: these are repeated. The masks that published systems use
+    (`methods.AS_SLAM_SYSTEMS`) are compared on real frames only.
+    """
+    if job.method in AS_SLAM_SYSTEMS:
+        return False
+    is_tested = job.method == "masked" and job.dilation_width == tested
+    return job.repetition == 0 or is_tested or job.method in ("baseline", "reduced")
 
 
 def reduced_jobs(best: pd.DataFrame, repetitions: int = 1) -> list[Job]:
@@ -42,10 +65,8 @@ def reduced_jobs(best: pd.DataFrame, repetitions: int = 1) -> list[Job]:
     This is each sequence's mean number of keypoints at its best width (Figure 4.12). best: the
     table of `best_widths`.
     """
-    jobs = []
-    for name, number in best["mean_keypoints"].items():
-        limit = max(1, round(number))  # OpenCV takes 0 as "no limit"
-        jobs.append(Job(name, "reduced", max_keypoints=limit))
+    limits = best["mean_keypoints"].round().clip(lower=1)  # OpenCV takes 0 as "no limit"
+    jobs = [Job(name, "reduced", max_keypoints=int(limit)) for name, limit in limits.items()]
     return repeated(jobs, ["thesis"], repetitions)
 
 
@@ -106,19 +127,137 @@ def independent_widths(
 
 
 def middle(values: pd.Series) -> tuple[float, float]:
-    """Return the ends of the middle LEVEL percent of a number of simulated studies."""
-    tail = (100 - LEVEL) / 200
+    """Return the ends of the middle 95 percent of a number of simulated studies."""
+    tail = (100 - compare.LEVEL) / 200
     return values.quantile(tail), values.quantile(1 - tail)
 
 
-def time_savings(seconds: pd.DataFrame) -> pd.Series:
-    """Return the change of time (%) from all keypoints for each dilation width (Equation 4.2).
+def table_4_1(masked: pd.DataFrame, reported_as: str) -> pd.DataFrame:
+    """Table 4.1: each sequence's best dilation width and mean number of keypoints.
 
-    It is negative if time is saved. seconds: the table of `timing.time_runs`, whose seconds are
-    added over the sequences. As in the thesis, they include making the masks and not the
-    prediction.
+    The last columns have the thesis's numbers; reported_as: how to name them.
     """
-    baseline = seconds[seconds["method"] == "baseline"]
-    masked = seconds[seconds["method"] == "masked"]
-    masked_seconds = masked.groupby("dilation_width")["seconds"].sum()
-    return percent_change(masked_seconds, baseline["seconds"].sum())
+    best = best_widths(masked)
+    reported = pd.DataFrame(REPORTED["table_4_1"]).set_index("sequence")
+    reported = reported.reindex(best.index).astype("Int64")
+    columns = {
+        "frames": best["frames"],
+        "dilation width (pixels)": best["dilation_width"],
+        "mean keypoints": best["mean_keypoints"].round().astype(int),
+        "failed runs": _failed_of(of_chosen_width(masked)),
+        f"width, {reported_as}": reported["dilation_width"],
+        f"mean keypoints, {reported_as}": reported["mean_keypoints"],
+    }
+    return pd.DataFrame(columns).rename_axis("sequence").reset_index()
+
+
+def table_of_change(
+    masked: pd.DataFrame,
+    baseline: pd.DataFrame,
+    shuffled: pd.DataFrame,
+    metric: str,
+    reported_as: str,
+) -> pd.DataFrame:
+    """Tables 4.2 and 4.3: a metric with all keypoints and with the best mask, and Equation 4.1.
+
+    The metric is in metres, Equation 4.1 in percent. The column "one run each" has the thesis's
+    literal procedure: one run of all keypoints and of each width (repetition 0), also to choose the
+    width. Beside it stands what this procedure gives if masks do nothing (`null_distribution`),
+    simulated from `shuffled`.
+    The last rows have the sum of the percentages (the thesis's "aggregate"), their mean with
+    Student's t interval, and their median.
+    """
+    best = of_chosen_width(masked)
+    number = {"rmse": "table_4_2", "mae": "table_4_3"}[metric]
+    by_sequence = {
+        "change (%)": changes(best, baseline, metric),
+        SINGLE: changes_of_repetition(masked, baseline, metric),
+        f"change (%), {reported_as}": pd.Series(REPORTED[f"{number}_{metric}_percent_change"]),
+    }
+    last_rows = {name: _summary(values) for name, values in by_sequence.items()}
+    studies = null_distribution(shuffled, masked["dilation_width"].nunique(), metric)
+    if len(studies.columns):
+        by_sequence[NULL], last_rows[NULL] = studies.mean(), _summary_of_studies(studies)
+    errors = pd.DataFrame(index=sorted(baseline["sequence"].unique()))
+    for method, rows in {"all keypoints": baseline, "best mask": best}.items():
+        mean = rows.groupby("sequence")[metric].mean()
+        errors[f"{metric.upper()}, {method} (m)"] = mean.map("{:.3g}".format).astype(float)
+        errors[f"failed runs, {method}"] = _failed_of(rows)
+    percent = pd.DataFrame(by_sequence).reindex(errors.index)
+    table = errors.join(pd.concat([percent, pd.DataFrame(last_rows)]).round(2), how="right")
+    order = [*errors, "change (%)", SINGLE, NULL, f"change (%), {reported_as}"]
+    return table.filter(order).rename_axis("sequence").reset_index()
+
+
+def _failed_of(runs: pd.DataFrame) -> pd.Series:
+    """Return the failed runs of each sequence as a text, "2 of 5"."""
+    failed = {name: compare.count_failed(rows) for name, rows in runs.groupby("sequence")}
+    return pd.Series(failed, dtype=str)
+
+
+def _summary(changes: pd.Series) -> dict[str, float]:
+    """Return the last rows of Tables 4.2 and 4.3 for one column of changes (%)."""
+    low, high = compare.mean_interval(changes)
+    return {
+        "sum (the thesis's aggregate)": changes.sum(min_count=1),
+        "mean": changes.mean(),
+        f"mean, {compare.LEVEL} % CI over sequences, from": low,
+        f"mean, {compare.LEVEL} % CI over sequences, to": high,
+        "median": changes.median(),
+        "sequences improved": float((changes < 0).sum()),
+    }
+
+
+def _summary_of_studies(studies: pd.DataFrame) -> dict[str, float]:
+    """Return the last rows for simulated studies (%), one row a study: means over the studies."""
+    means = studies.mean(axis=1)
+    low, high = middle(means)
+    of_studies = f"mean, middle {compare.LEVEL} % of {len(studies)} simulated studies"
+    return {
+        "sum (the thesis's aggregate)": studies.sum(axis=1).mean(),
+        "mean": means.mean(),
+        "median": studies.median(axis=1).mean(),
+        "sequences improved": (studies < 0).sum(axis=1).mean(),
+        f"{of_studies}, from": low,
+        f"{of_studies}, to": high,
+    }
+
+
+def procedure(runs: pd.DataFrame, shuffled: pd.DataFrame) -> pd.DataFrame:
+    """Return what the thesis's literal procedure gives (Tables 4.2 and 4.3), one row a metric.
+
+    Changes are in percent: mean, median, improved and failed (sequences) of repetition 0; lowest
+    and highest mean of a repetition; null_mean, null_low, null_high and null_improved if masks did
+    nothing (`null_distribution`).
+    """
+    masked, baseline = compare.of_method(runs, "masked"), compare.of_method(runs, "baseline")
+    widths = masked["dilation_width"].nunique()
+    # the embedded world repeats only one width, and one width is no choice
+    widths_run = masked.groupby("repetition")["dilation_width"].nunique()
+    repetitions = sorted(widths_run.index[widths_run == widths])
+    best = of_chosen_width(masked[masked["repetition"] == 0])
+    rows: dict[str, dict[str, Any]] = {}
+    for metric in ("rmse", "mae"):
+        single = pd.DataFrame(
+            {each: changes_of_repetition(masked, baseline, metric, each) for each in repetitions}
+        )
+        means = single.mean()
+        studies = null_distribution(shuffled, widths, metric)
+        null_low, null_high = middle(studies.mean(axis=1))
+        rows[compare.METRICS[metric]] = {
+            "mean": means[0],
+            "median": single[0].median(),
+            "improved": (single[0] < 0).sum(),
+            "sequences": len(single),
+            "failed": compare.has_failed(best).sum(),
+            "lowest": means.min(),
+            "highest": means.max(),
+            "repetitions": len(means),
+            "widths": widths,
+            "studies": len(studies),
+            "null_mean": studies.mean(axis=1).mean(),
+            "null_low": null_low,
+            "null_high": null_high,
+            "null_improved": (studies < 0).sum(axis=1).mean(),
+        }
+    return pd.DataFrame.from_dict(rows, orient="index").rename_axis("error").reset_index()

@@ -5,7 +5,7 @@
 
 import pandas as pd
 
-from thesis_repro.running import results
+from thesis_repro.running import provenance
 from thesis_repro.running.files import listed
 from thesis_repro.running.settings import ROOT, Settings
 from thesis_repro.study import compare, jobs
@@ -54,7 +54,7 @@ def network_note(settings: Settings) -> str:
     folders = listed(settings.build / "labels", "*")
     if not settings.figures_in_git or not folders:
         return ""
-    network, recorded = results.record(folders[0])["model"], read()["network"].iloc[0]
+    network, recorded = provenance.record(folders[0])["model"], read()["network"].iloc[0]
     if network == recorded:
         return f"The network of this run is the recorded one, to the bit ({network})."
     return (

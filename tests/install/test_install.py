@@ -14,7 +14,7 @@ from packaging.requirements import Requirement
 from trials import refused, run, snapshot, succeed
 
 import can_install
-from thesis_repro.running import results
+from thesis_repro.running import provenance
 from thesis_repro.running.settings import ROOT
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -142,7 +142,7 @@ def test_make_reads_settings_from_its_arguments_and_the_environment(checkout):
 
 def test_two_runs_in_one_folder_are_refused(checkout):
     folders = {"PROFILE": "smoke", "BUILD": str(checkout / "b"), "FIGURES": str(checkout / "f")}
-    with results.claimed(checkout / "b" / "embedded-smoke" / "notebooks"):
+    with provenance.claimed(checkout / "b" / "embedded-smoke" / "notebooks"):
         words = [f"{name}={value}" for name, value in folders.items()]
         second = run(["make", "-o", ".venv/ready", "figures", *words], checkout)
     assert second.returncode == 2 and "another run uses it" in second.stderr

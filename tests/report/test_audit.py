@@ -10,10 +10,18 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from thesis import ablations, audit, audit_rows, audit_run, domain_gap, section_4_2, trainings
+from thesis import (
+    ablations,
+    audit,
+    audit_of_data,
+    audit_of_tables,
+    domain_gap,
+    section_4_2,
+    trainings,
+)
 from thesis_repro.data.cityscapes import ID
 from thesis_repro.report import style
-from thesis_repro.running import results
+from thesis_repro.running import provenance
 from thesis_repro.running.settings import ROOT
 from thesis_repro.study import compare
 
@@ -49,7 +57,7 @@ def test_rows_are_numbered_and_every_measurement_has_a_row():
     ],
 )
 def test_arithmetic_with_the_thesiss_tables(row, quantity, metric, value):
-    table = audit.table(audit_rows.of_reported(), "made up")
+    table = audit.table(audit_of_tables.of_reported(), "made up")
     rows = table[
         (table["row"] == row) & (table["quantity"] == quantity) & (table["metric"] == metric)
     ]
@@ -119,7 +127,7 @@ def test_ablations_become_ratios_of_their_reference():
         noise=0.02,
     )
     runs = runs.assign(failed=1.0, across=0.1, down=0.2, sim3=runs["rmse"])
-    measurements = pd.DataFrame(audit_rows.of_ablations(runs))
+    measurements = pd.DataFrame(audit_of_tables.of_ablations(runs))
     ratios = measurements[measurements["unit"] == "ratio"].set_index(
         ["row", "metric", "estimator"]
     )["value"]
@@ -142,7 +150,7 @@ def test_other_tables_are_measured_by_sequence_with_their_number_of_frames():
             "building/fence": np.nan,
         }
     )
-    rows = audit_rows.of_shares(shares)
+    rows = audit_of_tables.of_shares(shares)
     assert {(row["quantity"], row["value"], row["n"], row["frames"]) for row in rows} == {
         ("boundary pixels lost", 30, 2, 2),
         ("boundary pixels lost, road/sidewalk", 60, 1, 2),
@@ -155,7 +163,7 @@ def test_other_tables_are_measured_by_sequence_with_their_number_of_frames():
             "residual": [1.0, 2.0, 1.0, 8.0],
         }
     )
-    (row,) = audit_rows.of_tracks(tracks)
+    (row,) = audit_of_tables.of_tracks(tracks)
     assert (row["row"], row["frames"], row["n"]) == ("32", 2, 1) and row["value"] == pytest.approx(
         4
     )
@@ -179,11 +187,11 @@ def test_right_pixels_are_counted_by_area():
     predicted = exact.copy()
     predicted[15:, :15] = ID["car"]  # half of the shadow
     predicted[5:10, 20:22] = ID["car"]  # a fifth of the pole
-    shares = audit_run.right_shares(predicted, exact, frame)
+    shares = audit_of_data.right_shares(predicted, exact, frame)
     assert shares["small"] == 80 and shares["dark"] == 50 and shares["lit"] == 100
     assert shares["large"] == pytest.approx(100 * (1 - 75 / 1150))
     assert shares["inside"] > shares["rim"]
-    assert "small" not in audit_run.right_shares(predicted, np.full_like(exact, 7), frame)
+    assert "small" not in audit_of_data.right_shares(predicted, np.full_like(exact, 7), frame)
 
 
 def test_the_audit_and_the_comparison_answer_a_question_with_the_same_number():
@@ -198,7 +206,7 @@ def test_the_audit_and_the_comparison_answer_a_question_with_the_same_number():
     compared = table[table["tested"] & (table["reference"] == "baseline")].set_index(
         ["method", "estimator", "metric"]
     )
-    audited = pd.DataFrame(audit_rows.of_study(runs, runs[runs["method"] == "baseline"]))
+    audited = pd.DataFrame(audit_of_tables.of_study(runs, runs[runs["method"] == "baseline"]))
     assert len(audited[audited["row"] == "39"]) == 3
     for row, method in (("15", "masked"), ("40", "fewer"), ("50", "corrected")):
         lines = audited[(audited["row"] == row) & (audited["metric"] == "RMSE")]
@@ -225,24 +233,12 @@ SCORES = pd.DataFrame(
     ],
     columns=["model", "domain", "images", "classes", "mean_iou", "sky_recall"],
 ).assign(accuracy=0.7)
-CLASSES = pd.DataFrame(
-    [
-        {
-            "model": row.model,
-            "domain": row.domain,
-            "class": name,
-            "id": number,
-            "share": 0.5,
-            "iou": iou,
-        }
-        for row in SCORES.itertuples()
-        for name, number, iou in (("road", 7, 0.8), ("sky", 23, 0.7))[: row.classes]
-    ]
-)
+SCORES["IoU: road"] = 0.8
+SCORES["IoU: sky"] = [0.7 if row.classes == 2 else float("nan") for row in SCORES.itertuples()]
 
 
 def test_the_table_shows_each_model_and_domain():
-    table = domain_gap.table(SimpleNamespace(scores=SCORES, classes=CLASSES)).set_index("measure")
+    table = domain_gap.table(SCORES).set_index("measure")
     assert list(table) == [
         f"{OWN}: {VALIDATION}",
         f"{OWN}: {STREETS}",
@@ -261,11 +257,11 @@ def test_the_table_shows_each_model_and_domain():
 
 
 def test_the_quality_of_label_maps_is_recorded(tmp_path):
-    assert domain_gap.label_map_quality(tmp_path) == []
+    assert domain_gap.label_map_quality(tmp_path).empty
     style.save_table(
         SCORES.assign(used=SCORES["model"] == SHIPPED), tmp_path, domain_gap.RECORD, "note"
     )
-    rows = domain_gap.label_map_quality(tmp_path)
+    rows = domain_gap.label_map_quality(tmp_path).to_dict("records")
     assert [
         (row["domain"], row["mean_iou"], row["classes"], row["images"], row["seen"]) for row in rows
     ] == [(VALIDATION, 0.5, 2, 20, False), (STREETS, 0.4, 2, 7, True)]
@@ -287,7 +283,7 @@ RECORDED = trainings.read()["network"].iloc[0]
 )
 def test_the_networks_are_compared(tmp_path, network, in_git, named):
     if network:
-        results.stage(tmp_path / "labels" / "00", model=network)
+        provenance.stage(tmp_path / "labels" / "00", model=network)
     note = trainings.network_note(SimpleNamespace(build=tmp_path, figures_in_git=in_git))
     assert bool(note) == bool(named) and all(name in note for name in named)
     assert ("XLA_FLAGS" in note) == (len(named) > 1)

@@ -80,11 +80,7 @@ DRAWN = {
     "masks": lambda: chapter3.figure_masks(
         FRAME, dict.fromkeys("abc", MASK), dict.fromkeys("abc", POINTS), MASK
     ),
-    "4.3": lambda: chapter4.figure_4_03(
-        FRAME, LABEL_MAP[::2, ::3], "sequence 00, frame 0", LABEL_MAP
-    ),
     "4.4": lambda: chapter4.figure_4_04(FRAME, MASK, POINTS, "sequence 00"),
-    "4.5": lambda: chapter4.figure_4_05(FRAME, POINTS, LABEL_MAP, MASK, POINTS, 10, "sequence 00"),
     "4.8": lambda: chapter4.figure_4_08(
         flicker.follow_window([FRAME] * 3, [LABEL_MAP, MOVED, MOVED], 5), "00"
     ),

@@ -12,8 +12,7 @@ import pytest
 from bs4 import BeautifulSoup
 
 from thesis import captions, page
-from thesis_repro.report import page as report_page
-from thesis_repro.report import style
+from thesis_repro.report import html, style
 from thesis_repro.running.settings import ROOT, read_settings
 
 SVG = '<svg height="100pt" width="200pt" xmlns="http://www.w3.org/2000/svg"><path d="M0 0"/></svg>'
@@ -60,9 +59,7 @@ def run(tmp_path):
     settings = replace(settings, figures=settings.published)
     settings.figures.mkdir()
     for artefact in ARTEFACTS:
-        for ending in report_page.ENDINGS[artefact["kind"]][
-            : 1 if artefact["kind"] == "figure" else None
-        ]:
+        for ending in html.ENDINGS[artefact["kind"]][: 1 if artefact["kind"] == "figure" else None]:
             text = {".svg": SVG}.get(ending, "What it shows")
             (settings.figures / f"{artefact['name']}{ending}").write_text(text)
         if artefact["kind"] == "table":
@@ -201,7 +198,7 @@ def test_markup_in_names_and_texts_is_escaped(run, tmp_path):
         assert link.startswith("#") or (settings.figures / unquote(link)).is_file(), link
 
 
-def test_the_page_in_git_is_made_from_what_is_in_git(run):
+def test_the_page_in_git_is_made_from_what_is_in_git():
     """After a change of docs/answer.md, a caption or a table: `make page`."""
     figures = ROOT / "figures"  # read, not written
     in_git = replace(read_settings({}), figures=figures)

@@ -1,6 +1,6 @@
 """Figures and tables of chapter 4, the comparison and the findings show the numbers of the runs."""
 
-import html
+from html import escape
 from types import SimpleNamespace
 
 import made_up
@@ -12,11 +12,10 @@ from cells import cells
 from drawn import problems
 from matplotlib.container import BarContainer
 
-from thesis import chapter4, few_keypoints, frames, section_4_2, tables
+from thesis import chapter4, few_keypoints, frames, section_4_2
 from thesis.captions import REPORTED
 from thesis_repro.errors import one_line
-from thesis_repro.report import comparison, findings, style, texts
-from thesis_repro.report import study as report_study
+from thesis_repro.report import comparison, findings, html, study_report, style, texts
 from thesis_repro.study import compare
 from thesis_repro.study.jobs import ESTIMATORS
 
@@ -68,9 +67,9 @@ def test_tables_of_the_thesiss_numbers_equal_the_thesiss(
             else 2 * (1 + reported[name] / 100) + {5: 0.5, 15: 1.0}.get(width, 0)
         ),
     )
-    table = tables.table_of_change(*widths_of(runs), NEVER_SHUFFLED, metric, "thesis").set_index(
-        "sequence"
-    )
+    table = section_4_2.table_of_change(
+        *widths_of(runs), NEVER_SHUFFLED, metric, "thesis"
+    ).set_index("sequence")
     changes = [column for column in table if column.startswith("change")]
     assert len(changes) == 3  # no column for masks that did nothing
     for column in changes:
@@ -79,7 +78,7 @@ def test_tables_of_the_thesiss_numbers_equal_the_thesiss(
             [mean, median], abs=0.05
         )
         assert table.loc["sequences improved", column] == improved
-    widths = tables.table_4_1(widths_of(runs)[0], "thesis")
+    widths = section_4_2.table_4_1(widths_of(runs)[0], "thesis")
     assert set(widths["dilation width (pixels)"]) == {10} and widths["width, thesis"].tolist()[
         :2
     ] == [10, 11]
@@ -91,7 +90,7 @@ def test_the_literal_procedure_is_that_of_repetition_0():
     # the mean is lowest at width 10, repetition 0 at width 5
     for width, errors in ((5, [0.6, 3, 3]), (10, [0.7, 0.1, 0.1]), (15, [1, 1, 1])):
         runs.loc[masked & (runs["dilation_width"] == width), "rmse"] = errors
-    shown = tables.table_of_change(*widths_of(runs), NEVER_SHUFFLED, "rmse", "thesis").iloc[0]
+    shown = section_4_2.table_of_change(*widths_of(runs), NEVER_SHUFFLED, "rmse", "thesis").iloc[0]
     assert shown["change (%)"] == pytest.approx(-70)
     assert shown["change (%), one run each"] == pytest.approx(-40)
 
@@ -101,32 +100,32 @@ def test_masks_that_do_nothing_are_told_beside_the_literal_procedure():
     baseline = {"baseline": [None]}
     options = {"estimators": ["thesis"], "repetitions": 30, "noise": 0.2}
     shuffled = made_up.runs(ELEVEN, lambda *_: 1.0, baseline, **options)
-    table = tables.table_of_change(*widths_of(runs), shuffled, "rmse", "thesis").set_index(
+    table = section_4_2.table_of_change(*widths_of(runs), shuffled, "rmse", "thesis").set_index(
         "sequence"
     )
     studies = section_4_2.null_distribution(shuffled, 3, "rmse")
     null = table["change (%), one run each, if masks did nothing"]
     assert null["mean"] == pytest.approx(studies.mean(axis=1).mean(), abs=0.006)
     assert null["mean"] < -5 and null["sequences improved"] > 6  # the best of three widths
-    of_rmse, _ = tables.procedure(runs, shuffled)
+    of_rmse, _ = section_4_2.procedure(runs, shuffled).to_dict("records")
     assert of_rmse["null_mean"] == pytest.approx(null["mean"], abs=0.006)
     assert of_rmse["lowest"] < of_rmse["highest"] and of_rmse["repetitions"] == 3
     once = runs[(runs["repetition"] == 0) | (runs["dilation_width"] != 5)]  # width 5 is run once
-    assert tables.procedure(once, shuffled)[0]["repetitions"] == 1
+    assert section_4_2.procedure(once, shuffled)["repetitions"][0] == 1
 
 
 def test_failed_runs_are_counted():
     runs = runs_of(ELEVEN, halved)
     failing = (runs["sequence"] == "03") & (runs["method"] == "masked")
     runs.loc[failing & (runs["repetition"] == 0), "failed"] = 5.0
-    table = tables.table_of_change(*widths_of(runs), NEVER_SHUFFLED, "rmse", "thesis").set_index(
-        "sequence"
-    )
+    table = section_4_2.table_of_change(
+        *widths_of(runs), NEVER_SHUFFLED, "rmse", "thesis"
+    ).set_index("sequence")
     assert table.loc["03", "failed runs, best mask"] == "1 of 3"
     for column in ("change (%)", "change (%), one run each"):
         assert table.loc["03", column] < 0 and table.loc["sequences improved", column] == 11
     assert (
-        tables.table_4_1(widths_of(runs)[0], "thesis")
+        section_4_2.table_4_1(widths_of(runs)[0], "thesis")
         .set_index("sequence")
         .loc["03", "failed runs"]
         == "1 of 3"
@@ -157,7 +156,7 @@ def test_errors_are_means_with_their_spread_and_the_lowest_is_bold():
     bold = table[ELEVEN].map(lambda cell: cell.startswith("**"))
     of_masks = bold[table["method"] == "masks, width 10"]
     assert (bold.sum() == 4).all() and of_masks.to_numpy().mean() > 0.9
-    pieces = report_study.latex_errors(table).split("\\end{tabular}")[:-1]
+    pieces = study_report.latex_errors(table).split("\\end{tabular}")[:-1]
     assert len(pieces) == 12 and all("{lllll}" in piece or "{llll}" in piece for piece in pieces)
     assert sum(piece.count("\\textbf{") for piece in pieces) == 44
     paths = runs[runs["method"] == "baseline"].assign(method="paths", source="slam")
@@ -177,9 +176,9 @@ def test_deviations_of_zero_are_a_note_below_the_table():
     has_deviation = table[ELEVEN[:5]].map(lambda cell: "±" in cell).all(axis=1)
     varied = (table["error"] == "aligned ATE (m)") & (table["estimator"] == "vote of all points")
     assert has_deviation.equals(varied) and varied.any()
-    text = report_study.latex_errors(table, 3)
-    assert "0.0000" not in text and text.count(report_study.NO_DEVIATION) == 6  # of 8 tables
-    assert report_study.NO_DEVIATION not in report_study.latex_errors(table)
+    text = study_report.latex_errors(table, 3)
+    assert "0.0000" not in text and text.count(study_report.NO_DEVIATION) == 6  # of 8 tables
+    assert study_report.NO_DEVIATION not in study_report.latex_errors(table)
 
 
 def test_failures_of_the_other_estimator_stand_in_the_summary():
@@ -215,11 +214,11 @@ def test_ratios_in_the_tables_equal_the_comparison():
     )
     unknown = runs_of(["77"], lambda *_: 1.0)  # a sequence that the thesis does not have
     assert np.isnan(
-        tables.table_of_change(*widths_of(unknown), NEVER_SHUFFLED, "rmse", "thesis").loc[
+        section_4_2.table_of_change(*widths_of(unknown), NEVER_SHUFFLED, "rmse", "thesis").loc[
             0, "change (%), thesis"
         ]
     )
-    assert pd.isna(tables.table_4_1(widths_of(unknown)[0], "thesis").loc[0, "width, thesis"])
+    assert pd.isna(section_4_2.table_4_1(widths_of(unknown)[0], "thesis").loc[0, "width, thesis"])
 
 
 @pytest.mark.parametrize(
@@ -270,8 +269,8 @@ def drawn_by_cells(runs):
     figures = {}
     save = SimpleNamespace(save_figure=lambda figure, name, note: figures.update({name: figure}))
     given = {"runs": runs, "SEQUENCES": sorted(runs["sequence"].unique()), "note": ""}
-    modules = {"np": np, "chapter4": chapter4, "frames": frames, "style": style}
-    modules["section_4_2"] = section_4_2
+    modules = {"np": np, "pd": pd, "chapter4": chapter4, "frames": frames, "style": style}
+    modules |= {"section_4_2": section_4_2, "compare": compare}
     names = given | modules | {"artefacts": save}
     for number in ("58", "54", "18", "55", "56", "26", "27"):
         exec(cells("08_results.ipynb", "code")[f"08-{number}"], names)
@@ -401,14 +400,14 @@ HOSTILE = [
 
 
 def test_names_stay_names_in_texts_and_tables(tmp_path):
-    shown = [html.escape(one_line(name)) for name in HOSTILE]
+    shown = [escape(one_line(name)) for name in HOSTILE]
     rows = pd.DataFrame({"sequence": HOSTILE, "masks": HOSTILE, "ate": -1.0})
     style.save_table(rows, tmp_path, "table", HOSTILE[0])
-    read = texts.html((tmp_path / "table.md").read_text(encoding="utf-8"))
+    read = html.from_markdown((tmp_path / "table.md").read_text(encoding="utf-8"))
     assert read.count("<td") == 3 * len(HOSTILE) and f"<p>{shown[0]}</p>" in read
     assert all(read.count(f">{name}</td>") == 2 for name in shown)
     # a spreadsheet must not calculate with it, and the page shows it as it is in the file
-    table = tables.read(tmp_path / "table.csv")
+    table = pd.read_csv(tmp_path / "table.csv", dtype=str, keep_default_na=False)
     in_file = [name.encode(errors="backslashreplace").decode() for name in HOSTILE]
     in_file[HOSTILE.index("=1+1")] = "'=1+1"
     assert list(table["sequence"]) == list(table["masks"]) == in_file

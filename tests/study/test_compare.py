@@ -72,10 +72,11 @@ def test_the_verdict_follows_the_interval(factor, verdict):
     assert five["n"] == 5 and five["verdict"] == "too few sequences to tell"
 
 
+@pytest.mark.torture
 def test_intervals_that_exclude_the_true_ratio_by_chance():
     """Print the percentages of docs/reading-results.md.
 
-    Call it with pytest -s -k by_chance tests/study.
+    Call it with pytest -m torture -s -k by_chance tests/study.
     """
     random = np.random.default_rng(0)
     draws = {

@@ -12,7 +12,7 @@ from thesis import ablations, section_4_2
 from thesis_repro import mask_files, masks
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.odometry import THESIS, keypoints
-from thesis_repro.odometry.odometry import detect
+from thesis_repro.odometry.loop import detect
 from thesis_repro.study import compare, controls, methods, runner
 from thesis_repro.study.jobs import first_jobs
 from thesis_repro.study.sources import Source
@@ -123,26 +123,20 @@ def test_controls_leave_as_many_keypoints_as_masks_of_the_tested_width(
 
 def test_every_ablation_differs_from_its_reference_in_one_thing(small_world, small_labels):
     sequence = Sequence(small_world / "kitti", "00").subset(4)
-    runs = ablations.runs_of(sequence, small_labels / "00", repetitions=2)
-    runs = {(job.method, job.estimator, job.repetition): run[1:] for job, run in runs.items()}
-    settings, thesis_masks = runs["masked", "thesis", 0]
+    runs = ablations.choices(sequence, small_labels)
+    settings, thesis_masks = runs["masked"]
     assert settings == THESIS
     expected = mask_files.LabelMasks(small_labels / "00", sequence, 10)
     assert np.array_equal(thesis_masks[0], expected[0])
-    dropped, same = runs["filter", "thesis", 0]
+    dropped, same = runs["filter"]
     assert dropped.detector is keypoints.filtered and same is thesis_masks
-    repetitions = {
-        estimator: {key[2] for key in runs if key[:2] == ("baseline", estimator)}
-        for estimator in ("thesis", "refined")
-    }
-    assert repetitions == {"thesis": {0, 1}, "refined": {0, 1}}
     for method in ("nearest", "symmetric"):
-        _, method_masks = runs[method, "thesis", 0]
+        _, method_masks = runs[method]
         assert not np.array_equal(method_masks[0], thesis_masks[0])
         assert 0.5 < method_masks[0].sum() / thesis_masks[0].sum() < 2
     label_map = cv2.imread(str(small_labels / "00" / sequence.frame_paths[0].name), 0)
     enlarged = cv2.resize(label_map, sequence.size[::-1], interpolation=cv2.INTER_NEAREST)
-    _, method_masks = runs["no-vegetation", "thesis", 0]
+    _, method_masks = runs["no-vegetation"]
     assert np.array_equal(method_masks[0] == 0, np.isin(enlarged, (21, 22)))
 
 

@@ -10,8 +10,8 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
+from thesis_repro.study.plan import Study
 from thesis_repro.study.sources import Source
-from thesis_repro.study.study import Study
 
 GOLDEN = Path(__file__).with_name("runs.csv")
 pytestmark = pytest.mark.bits

@@ -15,7 +15,7 @@ from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.odometry import metrics
 from thesis_repro.odometry.keypoints import filtered
-from thesis_repro.running import messages
+from thesis_repro.running import program
 from thesis_repro.segmentation import training
 from thesis_repro.study import compare, methods, runner, workers
 from thesis_repro.study.jobs import Job, first_jobs
@@ -101,7 +101,7 @@ def test_a_failed_run_is_reported_and_stops_no_other_run(
     shutil.copytree(small_labels, tmp_path / "labels")
     broken = tmp_path / "labels" / "00" / "000003.png"
     broken.write_bytes(broken.read_bytes()[:-20])
-    messages.print_messages()
+    program.print_messages()
     jobs = [
         *first_jobs(opened(small_world)[:1], {"thesis": WIDTHS}),
         Job("00", "true-labels", 10),
@@ -213,10 +213,9 @@ def test_a_slow_stage_shows_in_its_row(sequence, model, monkeypatch):
         and (table["milliseconds"] > 0).all()
     )
     stages_of = table.groupby("method")["stage"].agg(list)
-    assert stages_of["masked, width 5"] == list(timing.STAGES)
-    assert stages_of["all keypoints"] == [
-        stage for stage in timing.STAGES if stage not in ("segmentation", "mask")
-    ]
+    steps = ["detection", "tracking", "pose"]
+    assert stages_of["masked, width 5"] == ["read", "segmentation", "mask", *steps]
+    assert stages_of["all keypoints"] == ["read", *steps]
     slow = table.set_index(["method", "stage"])["milliseconds"]
     assert slow["masked, width 5", "mask"] > 500 > slow.drop(("masked, width 5", "mask")).max()
 

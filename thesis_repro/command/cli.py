@@ -12,7 +12,7 @@ from typing import Any
 
 from thesis_repro.command.options import MASK_OPTIONS, build_parser
 from thesis_repro.errors import InputError, one_line
-from thesis_repro.running import messages
+from thesis_repro.running import program
 from thesis_repro.running.settings import ALL_WIDTHS, PROFILES, SEED
 
 # options that name an output file: its content, and the endings that its name may have (none given:
@@ -33,7 +33,7 @@ def synthesize(options: Any) -> None:
     import street_world
 
     new, total = street_world.write(options.out, **PROFILES[options.profile].world, seed=SEED)
-    messages.summary(
+    program.summary(
         f"{options.out}: kitti and cityscapes of the embedded world, profile {options.profile}, "
         f"{total:,} images with their label maps",
         total - new,
@@ -71,7 +71,7 @@ def predict(options: Any) -> None:
         new = prediction.write_label_maps(model, paths, output, scale=float(options.scale))
         reused += len(paths) - new
         lines.append(f"{output}: {len(paths)} label maps")
-    messages.summary("\n".join(lines), reused)
+    program.summary("\n".join(lines), reused)
 
 
 def masks(options: Any) -> None:
@@ -86,7 +86,7 @@ def masks(options: Any) -> None:
     _check_outputs(options, options.labels, sequence.folder)
     _warn(_check_masks(sequence, [label_masks]))
     write_masks(label_masks, options.folder)
-    messages.summary(one_line(f"{options.folder}: {len(label_masks)} masks"))
+    program.summary(one_line(f"{options.folder}: {len(label_masks)} masks"))
 
 
 def odometry(options: Any) -> None:
@@ -115,7 +115,7 @@ def odometry(options: Any) -> None:
     if options.tum:
         write_tum(options.tum, result.poses, sequence.times)
     steps = len(sequence), result.failed_steps, result.dropped_steps
-    _warn(checks.of_run(sequence.name, *steps, settings.scale_gate))
+    _warn(checks.run_warnings(sequence.name, *steps, settings.scale_gate))
     if sequence.has_truth:
         reason = metrics.foreign_truth(result.poses, sequence.poses)
         _warn([f"{sequence.poses_path}: {reason}"] * bool(reason))
@@ -143,10 +143,10 @@ def odometry(options: Any) -> None:
 def study(options: Any) -> int:
     """Compare your own masks, keypoints or paths with all keypoints and with controls."""
     from thesis_repro import checks
-    from thesis_repro.data import kitti
-    from thesis_repro.running import results
+    from thesis_repro.data import kitti, layout
+    from thesis_repro.running import provenance
     from thesis_repro.study import sources
-    from thesis_repro.study.study import Study
+    from thesis_repro.study.plan import Study
 
     if not options.sources:
         raise InputError(
@@ -164,7 +164,7 @@ def study(options: Any) -> int:
     if has_labels:
         all_widths = ALL_WIDTHS if mask_settings.has_width else ()
         widths = widths.union(*options.widths or [all_widths])
-    names = dict.fromkeys(kitti.locate(options.kitti, name)[1].name for name in options.sequences)
+    names = dict.fromkeys(layout.locate(options.kitti, name)[1].name for name in options.sequences)
     planned = Study(
         options.kitti.absolute(),
         tuple(names or kitti.sequences(options.kitti)),
@@ -182,24 +182,24 @@ def study(options: Any) -> int:
     folder = options.folder.absolute()
     _check_outputs(options, *(source.folder for source in planned.sources))
     # this import takes seconds, so the input is checked first
-    from thesis_repro.report import study
+    from thesis_repro.report import study_report
 
-    with results.claimed(folder):
+    with provenance.claimed(folder):
         warnings = []
-        for sequence, masks in study.shown_masks(planned):
+        for sequence, masks in study_report.shown_masks(planned):
             warnings += _warn(_check_masks(sequence, masks))
         workers = (options.jobs, options.dask)
         if not any(sequence.has_truth for sequence in planned.opened):
             worths = planned.worths(folder, *workers)
             if worths is not None:  # otherwise the run below says that the ground truth is missing
-                file = study.write_worths(planned, worths, folder)
-                messages.summary(f"no ground truth, so no errors; worth of keypoints: {file}")
+                file = study_report.write_worths(planned, worths, folder)
+                program.summary(f"no ground truth, so no errors; worth of keypoints: {file}")
                 return 0
         outcome = planned.run(folder, *workers)
         planned = replace(planned, sequences=tuple(outcome.table["sequence"].unique()))
         runs = outcome.table[outcome.table["method"] == "baseline"].drop_duplicates("sequence")
         of_runs = [
-            checks.of_run(run.sequence, run.frames, run.flagged) for run in runs.itertuples()
+            checks.run_warnings(run.sequence, run.frames, run.flagged) for run in runs.itertuples()
         ]
         warnings += outcome.warnings + _warn(chain(*of_runs))
         worths = None
@@ -209,9 +209,9 @@ def study(options: Any) -> int:
             worths = replace(planned, sources=tuple(measured)).worths(folder, *workers)
         except InputError as error:  # the runs are there, so their page is written
             warnings += _warn([f"no worth of keypoints: {error}"])
-        page = study.write(planned, outcome.table, folder, warnings, worths)
+        page = study_report.write(planned, outcome.table, folder, warnings, worths)
     made = f"{len(outcome.table):,} runs, {outcome.failed_jobs:,} failed"
-    messages.summary(f"{made}; open {page} in a browser", outcome.kept)
+    program.summary(f"{made}; open {page} in a browser", outcome.kept)
     return int(outcome.failed_jobs > 0)
 
 
@@ -298,11 +298,11 @@ def _check_masks(sequence: Any, mask_sets: Iterable) -> list[str]:
     """Print what masks of a sequence hold, and return warnings of doubtful input."""
     from thesis_repro import checks
 
-    warnings = checks.of_sequence(sequence)
+    warnings = checks.sequence_warnings(sequence)
     for masks in mask_sets:
         with suppress(InputError):  # a file that cannot be read is reported when it is used
-            messages.log.info(checks.describe_masks(masks, sequence))
-            warnings += checks.of_masks(masks)
+            program.log.info(checks.describe_masks(masks, sequence))
+            warnings += checks.mask_warnings(masks)
     return warnings
 
 
@@ -310,7 +310,7 @@ def _warn(lines: Iterable[str]) -> list[str]:
     """Print warnings, and return them."""
     warnings = list(lines)
     for line in warnings:
-        messages.log.warning(line)
+        program.log.warning(line)
     return warnings
 
 
@@ -320,20 +320,16 @@ def _image_folders(root: Path) -> Iterator[tuple[Path, list[Path]]]:
     The path is a folder of images, a sequence, a KITTI folder or a folder of sequences.
     Raises InputError if there are no images.
     """
-    from thesis_repro.data import kitti
+    from thesis_repro.data import layout
 
     folders = [root]
-    if root.is_dir() and not kitti.has_frames(root):
-        parent = kitti.folder_of(root)
+    if root.is_dir() and not layout.has_frames(root):
+        parent = layout.sequences_folder(root)
         if not parent.is_dir():
             parent = root
-        folders = kitti.folders_with_frames(parent) or [root]
+        folders = layout.folders_with_frames(parent) or [root]
     for folder in folders:
-        image_folder = kitti.images_of(folder)
-        paths = kitti.frames_in(image_folder)
-        if not paths:
-            raise InputError(f"{image_folder}: holds no PNG or JPEG images")
-        yield folder, paths
+        yield folder, layout.frames_in(layout.frame_folder(folder))
 
 
 def _mask_settings(options: Any, has_labels: bool = True) -> Any:
@@ -411,7 +407,7 @@ def _print(options: Any, record: Any, template: str, **values: Any) -> None:
         text = texts.render(template, record=record, **values).rstrip()
     print(text)
     for name, path in _output_files(options).items():
-        messages.log.info(f"{path}: {OUTPUT_FILES[name][0]}")
+        program.log.info(f"{path}: {OUTPUT_FILES[name][0]}")
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -419,4 +415,4 @@ def main(arguments: list[str] | None = None) -> int:
     arguments = sys.argv[1:] if arguments is None else arguments
     options = build_parser(COMMANDS, arguments).parse_args(arguments)
     os.environ["MPLBACKEND"] = "agg"  # commands draw only into files
-    return messages.run(lambda: options.function(options))
+    return program.run(lambda: options.function(options))

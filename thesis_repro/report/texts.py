@@ -8,10 +8,8 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-import mistune
 import pandas as pd
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
-from markupsafe import Markup
 
 from thesis_repro.errors import one_line
 from thesis_repro.study import compare
@@ -92,15 +90,3 @@ TEMPLATES.filters |= {
     "ratio": ratio_and_far_off,
     "number": number,
 }
-
-
-class _Renderer(mistune.HTMLRenderer):
-    def heading(self, text: str, level: int, **attributes: Any) -> str:
-        # lower than the headings of the page
-        return super().heading(text, max(4, level + 1), **attributes)
-
-
-def html(text: str) -> Markup:
-    """Convert Markdown to HTML. HTML tags in the Markdown are shown as text."""
-    convert = mistune.create_markdown(renderer=_Renderer(escape=True), plugins=["table"])
-    return Markup(convert(text))

@@ -1,1 +1,1 @@
-"""What every run needs: settings, whole files, folders of results, messages."""
+"""What every run needs: settings, whole files, the provenance of results, how a program ends."""

@@ -11,7 +11,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stdout
 
-from thesis_repro.running import messages
+from thesis_repro.running import program
 
 # Settings that give the same bits on x86 processors with AVX2, together with `exact.same_bits`.
 ARITHMETIC = {
@@ -61,7 +61,7 @@ def quietly() -> Iterator[None]:
 
     Errors are raised. The message that there is no GPU is hidden too.
     """
-    with messages.quiet(), redirect_stdout(io.StringIO()):
+    with program.quiet(), redirect_stdout(io.StringIO()):
         yield
         if not any(map(os.path.exists, GPUS)):
             sys.modules["tensorflow"].config.list_physical_devices()

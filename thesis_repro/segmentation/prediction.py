@@ -13,7 +13,7 @@ import tensorflow as tf
 from thesis_repro import segmentation
 from thesis_repro.data.cityscapes import read_image
 from thesis_repro.errors import InputError
-from thesis_repro.running import files, results
+from thesis_repro.running import files, provenance
 from thesis_repro.segmentation import training
 
 SIZE = 320  # height and width of written label maps, pixels
@@ -60,8 +60,8 @@ def write_label_maps(
     as in the appendix. scale: as in `predict`.
     A killed run resumes: complete batches are skipped, and of an incomplete batch all images are
     predicted again, because the bits depend on the batch, but only missing files are written. The
-    folder is a stage (see results): label maps of another model or of other images in it are moved
-    aside.
+    folder is a stage (see provenance): label maps of another model or of other images in it are
+    moved aside.
 
     Returns the number of images predicted.
     Raises InputError for an unreadable image, two images of one name, and a folder that holds files
@@ -73,24 +73,23 @@ def write_label_maps(
         raise InputError(
             f"{paths[0].parent}: two images share a name, so their label maps would; rename one"
         )
-    with results.claimed(output_dir):
+    with provenance.claimed(output_dir):
         folder = Path(output_dir).absolute()
         inputs = {
             "model": training.weights_digest(model),
-            "frames": results.digest_of_files(paths),
+            "frames": provenance.digest_of_files(paths),
             "batch_size": batch_size,  # the arithmetic may round differently for another one
-            **results.made_with("tensorflow", "keras", "opencv"),
-            "code": results.digest_of_code(
+            **provenance.made_with("tensorflow", "keras", "opencv"),
+            "code": provenance.digest_of_code(
                 "thesis_repro.segmentation.prediction",
                 "thesis_repro.segmentation.exact",
                 "thesis_repro.data.cityscapes",
-                "thesis_repro.data.kitti",
             ),
             "arithmetic": segmentation.arithmetic(),
         }
         if scale != 1:
             inputs["scale"] = scale
-        results.stage(folder, **inputs)
+        provenance.stage(folder, **inputs)
         pairs = [(path, folder / name) for path, name in zip(paths, names)]
         batches = [pairs[start : start + batch_size] for start in range(0, len(pairs), batch_size)]
         batches = [batch for batch in batches if not all(path.is_file() for _, path in batch)]

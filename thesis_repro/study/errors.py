@@ -40,10 +40,8 @@ def path_errors(poses: np.ndarray, true: np.ndarray) -> dict[str, float]:
     They are those of `metrics.errors` and `metrics.step_errors`; t_rel (percent) and r_rel (degrees
     per 100 m) are those of `metrics.kitti_errors`.
     """
-    kitti = metrics.kitti_errors(poses, true)
     return {
         **metrics.errors(poses, true),
         **metrics.step_errors(poses, true),
-        "t_rel": kitti["t_rel"],
-        "r_rel": kitti["r_rel"],
+        **metrics.kitti_errors(poses, true),
     }

@@ -24,7 +24,7 @@ from thesis_repro.errors import InputError
 from thesis_repro.mask_files import LabelMasks, MaskFolder
 from thesis_repro.odometry import THESIS, OdometrySettings
 from thesis_repro.odometry.runs import is_flagged, poses_of
-from thesis_repro.running import messages, results
+from thesis_repro.running import program, provenance
 from thesis_repro.running.files import listed, progress, write_text
 from thesis_repro.study import compare
 from thesis_repro.study.controls import OtherFrame, min_distance
@@ -89,7 +89,7 @@ def run_all(
     `run(sequence, settings)` in place of the odometry.
     folder: for the results, one file a run. Results from other data or code in it are moved aside,
     and runs with other settings are made again. made_from: what the masks of a sequence come from,
-    {sequence: inputs} or {sequence/source: inputs}, see `results.stage`. failed: reasons of jobs
+    {sequence: inputs} or {sequence/source: inputs}, see `provenance.stage`. failed: reasons of jobs
     that cannot run.
     processes, scheduler: see `workers.open_pool`; the results do not depend on them. The workers of
     a scheduler need this package, and all folders under the same paths. One thread a worker is
@@ -102,7 +102,7 @@ def run_all(
     lost.
     """
     sequences = {sequence.name: sequence for sequence, _, _ in runs.values()}
-    with results.claimed(folder):
+    with provenance.claimed(folder):
         for sequence in sequences.values():
             _stage(folder, sequence, made_from)
             _drop_changed(runs, folder / sequence.name)
@@ -146,7 +146,7 @@ def run_jobs(
     made_from: dict[str, dict[str, Any]] = {}
     for name, sequence in opened.items():
         true_maps = listed(true_labels(sequence.root, name))
-        made_from[name] = {"true_labels": results.digest_of_files(true_maps)}
+        made_from[name] = {"true_labels": provenance.digest_of_files(true_maps)}
         for source in sources_by_name.values():
             place = f"{name}/{source.name}" if source.name else name
             made_from.setdefault(place, {}).update(source.record(name))
@@ -244,7 +244,7 @@ def _run_passes(
         calls = []
         for pass_jobs in in_passes(runs, sequences, pool.size):
             sequence = sequences[pass_jobs[0].sequence]
-            record = results.record(folder / sequence.name)
+            record = provenance.record(folder / sequence.name)
             pass_runs = {job: runs[job][1:] for job in pass_jobs}
             calls.append((pass_runs, sequence, folder, record))
         with progress(None, "odometry", total=frames(runs), unit="frame") as bar:
@@ -263,7 +263,7 @@ def _report(reasons: Mapping[Job, str]) -> list[str]:
     for (name, reason), runs in by_reason.items():
         shown = textwrap.shorten(", ".join(runs), 80, placeholder=" ...")
         lines.append(f"sequence {name}, {shown}: failed: {reason}")
-        messages.log.warning(lines[-1])
+        program.log.warning(lines[-1])
     return lines
 
 
@@ -278,15 +278,15 @@ def _stage(folder: Path, sequence: Sequence, made_from: Mapping[str, Mapping[str
             f"{sequence.poses_path}: no such file; without ground truth, sequence {sequence.name} has no "
             "errors to compare; leave it out (the odometry command runs it)"
         )
-    results.stage(
+    provenance.stage(
         folder / sequence.name,
         **_versions(),
-        sequence=results.digest_of_files(sequence.files),
+        sequence=provenance.digest_of_files(sequence.files),
         **made_from.get(sequence.name, {}),
     )
     for place, inputs in made_from.items():
         if place.startswith(f"{sequence.name}/"):
-            results.stage(folder / place, **inputs)
+            provenance.stage(folder / place, **inputs)
 
 
 def _drop_changed(runs: Mapping[Job, Run], folder: Path) -> None:
@@ -319,8 +319,8 @@ def _code(estimator: Any) -> str:
 
 def _versions() -> dict[str, Any]:
     return {
-        "code": results.digest_of_code(*CODE, without=WITHOUT),
-        **results.made_with("opencv", "numpy", "numba"),
+        "code": provenance.digest_of_code(*CODE, without=WITHOUT),
+        **provenance.made_with("opencv", "numpy", "numba"),
     }
 
 
@@ -337,7 +337,7 @@ def _run_pass(
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)  # the processes already use every core
     try:
-        results.check_worker(folder / sequence.name, record, **_versions())
+        provenance.check_worker(folder / sequence.name, record, **_versions())
         known: set[Any] = set()
         for job, (_, masks) in runs.items():
             try:

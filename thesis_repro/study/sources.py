@@ -18,7 +18,7 @@ from thesis_repro.data.trajectories import have_times, read_poses, read_poses_at
 from thesis_repro.errors import InputError
 from thesis_repro.mask_files import LabelMasks, MaskFolder, folder_of_sequence, read_mask
 from thesis_repro.masks import MaskSettings
-from thesis_repro.running import results
+from thesis_repro.running import provenance
 from thesis_repro.running.files import images, listed
 
 KINDS = {
@@ -100,8 +100,8 @@ class Source:
     def record(self, sequence: str) -> dict[str, str]:
         """Return the digests and settings that the results of a sequence depend on."""
         if self.kind in UNMASKED:
-            return {self.kind: results.digest_of_file(self.file(sequence))}
-        digest = results.digest_of_files(listed(folder_of_sequence(self.folder, sequence)))
+            return {self.kind: provenance.digest_of_file(self.file(sequence))}
+        digest = provenance.digest_of_files(listed(folder_of_sequence(self.folder, sequence)))
         if self.has_label_maps:
             settings = {"settings": str(self.settings), **label_ids.record(self.settings.ids)}
             return {self.kind: digest, **settings}

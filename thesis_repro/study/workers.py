@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 from joblib.externals.loky import ProcessPoolExecutor
 
 from thesis_repro.errors import InputError
-from thesis_repro.running import messages
+from thesis_repro.running import program
 
 TIMEOUT = 8  # seconds that a scheduler has to answer
 # Workers share the cores, so a library in one of them uses one thread, as joblib has it.
@@ -31,13 +31,13 @@ class Pool(NamedTuple):
         """Yield the results of calls, which are tuples of arguments, in their order."""
         if self.executor is None:
             for call in calls:
-                messages.check_stop()
+                program.check_stop()
                 yield function(*call)
             return
-        with messages.starting_workers():
+        with program.starting_workers():
             futures = [self.executor.submit(function, *call) for call in calls]
         for future in futures:
-            messages.check_stop()
+            program.check_stop()
             yield future.result()
 
 
@@ -52,9 +52,9 @@ def open_pool(processes: int, scheduler: str | None = None) -> Iterator[Pool]:
         yield Pool(1)
         return
     if scheduler is None:
-        with messages.unstopped():  # not joblib's shared executor, which callers may use, too
+        with program.unstopped():  # not joblib's shared executor, which callers may use, too
             executor = ProcessPoolExecutor(
-                processes, initializer=messages.leave_ctrl_c_to_parent, env=ONE_THREAD
+                processes, initializer=program.leave_ctrl_c_to_parent, env=ONE_THREAD
             )
         try:
             yield Pool(processes, executor)

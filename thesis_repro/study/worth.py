@@ -72,11 +72,11 @@ from thesis_repro.odometry import (
     scales,
 )
 from thesis_repro.odometry.keypoints import filled, spread
-from thesis_repro.odometry.odometry import MIN_MATCHES, PROBABILITY, normalise
+from thesis_repro.odometry.loop import MIN_MATCHES, normalise
 from thesis_repro.odometry.refined.fit import fit, smaller_rotation
 from thesis_repro.odometry.runs import check, inside
 from thesis_repro.odometry.sharing import SharedCalls
-from thesis_repro.running import results
+from thesis_repro.running import provenance
 from thesis_repro.running.files import progress
 from thesis_repro.study import compare, jobs, methods
 from thesis_repro.study.runner import CODE
@@ -141,7 +141,7 @@ def worth(
     steps = steps[spaced.round().astype(int)]
     shared = SharedCalls()
     rows: list[dict] = []
-    for index in steps if description is None else progress(steps, description):
+    for index in progress(steps, description):
         random, chosen = tracked(sequence, int(index), choices, shared, calls)
         references: dict[tuple, dict] = {}  # of random keypoints
         for (name, number), tracks in chosen.items():
@@ -174,6 +174,7 @@ def tracked(
 ) -> tuple[Tracks, dict[tuple[str, int], Tracks]]:
     """Return all keypoints of frame `index`, and those of each choice, tracked into the next."""
     frame, following = sequence.frame(index), sequence.frame(index + 1)
+    frame.setflags(write=False)  # so that all choices share it
     visible = sequence.visible(index)
     made = {id(masks): masks[index] for _, masks in choices.values() if masks is not None}
     everything = {_RANDOM: (THESIS, None), **choices}
@@ -246,9 +247,7 @@ def refined_motion(tracks: Tracks, indices: np.ndarray) -> Motion | None:
     if len(indices) < MIN_MATCHES:
         return None
     current, previous = tracks.current[indices], tracks.previous[indices]
-    matrix, inliers = opencv_exact.find_essential_matrix(
-        current, previous, tracks.threshold, PROBABILITY
-    )
+    matrix, inliers = opencv_exact.find_essential_matrix(current, previous, tracks.threshold)
     if matrix is None or inliers is None or matrix.shape != (3, 3) or not np.isfinite(matrix).all():
         return None
     matches = Matches(current, previous, tracks.threshold, inliers.ravel() > 0)
@@ -331,16 +330,16 @@ def measure(
     files: dict[Path, tuple] = {}
     for sequence in sequences:
         inputs = {
-            "sequence": results.digest_of_files(sequence.files),
+            "sequence": provenance.digest_of_files(sequence.files),
             "sources": [source.record(sequence.name) for source in sources],
             "width": width,
             "options": options,
-            "code": results.digest_of_code(
+            "code": provenance.digest_of_code(
                 *CODE, "thesis_repro.study.methods", "thesis_repro.study.worth"
             ),
-            **results.made_with("opencv", "numpy", "numba"),
+            **provenance.made_with("opencv", "numpy", "numba"),
         }
-        stage = results.stage(folder / sequence.name, **inputs)
+        stage = provenance.stage(folder / sequence.name, **inputs)
         for number in numbers:
             files[stage / f"{number}.csv"] = sequence, sources, width, number, options
     waiting = [(file, *call) for file, call in files.items() if not file.is_file()]
@@ -369,7 +368,7 @@ def _measure_one(
     except Exception as error:  # of own keypoints
         reason = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
         raise InputError(f"{sequence.folder}: {reason}") from error
-    results.write_table(file, table)
+    provenance.write_table(file, table)
 
 
 # Over several streets

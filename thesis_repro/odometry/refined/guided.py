@@ -11,7 +11,7 @@ from opencv_exact import MAX_SAMPLES, WELL_CONDITIONED, draw_samples, epipolar, 
 from opencv_exact.compiling import compiled, inlined
 from thesis_repro.odometry.refined import matrices
 from thesis_repro.odometry.refined.fit import columns, near_epipolar_lines
-from thesis_repro.odometry.types import Matches
+from thesis_repro.odometry.step import Matches
 
 
 def ransac_with_prior(

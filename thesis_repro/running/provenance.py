@@ -1,4 +1,4 @@
-"""Folders of results: the inputs that they were made from, and their locks.
+"""What results were made from: folders of results with a record of their inputs, and locks.
 
 A *stage* is a folder of results with a record of their inputs (`stage`). Its lock keeps other runs
 out (`claimed`). A *digest* stands for the content of an input and has twelve hexadecimal digits.
@@ -20,7 +20,7 @@ import cv2
 import pandas as pd
 
 from thesis_repro.errors import InputError
-from thesis_repro.running import messages
+from thesis_repro.running import program
 from thesis_repro.running.files import TEMPORARY, progress, write_text
 from thesis_repro.running.settings import ROOT
 
@@ -71,7 +71,7 @@ def _move_aside(folder: Path, changed: str) -> None:
     # the record goes last, so that a killed move can be repeated
     for path in sorted(folder.iterdir(), key=lambda path: path.name == RECORD):
         path.rename(aside / path.name)
-    messages.log.info(f"{folder}: moved what was made with another {changed} to {aside}")
+    program.log.info(f"{folder}: moved what was made with another {changed} to {aside}")
 
 
 def record(folder: str | Path) -> Any:
@@ -149,7 +149,7 @@ def _lock(descriptor: int, folder: Path) -> None:
     except BlockingIOError:
         raise InputError(f"{folder}: another run uses it; wait, or name another folder") from None
     except OSError:
-        messages.log.warning(f"{folder}: cannot be locked; do not start a second run in it")
+        program.log.warning(f"{folder}: cannot be locked; do not start a second run in it")
 
 
 def write_table(path: str | Path, table: pd.DataFrame) -> None:

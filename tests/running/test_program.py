@@ -6,7 +6,7 @@ import signal
 import pytest
 
 from thesis_repro.errors import InputError
-from thesis_repro.running import files, messages
+from thesis_repro.running import files, program
 
 
 def failing(error):
@@ -35,20 +35,20 @@ def handlers():
     ],
 )
 def test_bad_input_and_errors_of_the_machine_are_one_line(error, says, capsys):
-    assert messages.run(failing(error)) == 1
+    assert program.run(failing(error)) == 1
     line = capsys.readouterr().err
     assert line.startswith("error: ") and says in line and line.count("\n") == 1
 
 
 def test_unexpected_errors_are_raised():
     with pytest.raises(ZeroDivisionError):
-        messages.run(failing(ZeroDivisionError("1/0")))
+        program.run(failing(ZeroDivisionError("1/0")))
 
 
 def test_warnings_and_the_summary_are_printed_apart(capsys):
-    messages.print_messages()
-    messages.log.warning("sequence 00 failed")
-    messages.summary("3 runs", 2)
+    program.print_messages()
+    program.log.warning("sequence 00 failed")
+    program.summary("3 runs", 2)
     printed = capsys.readouterr()
     assert printed.out.startswith("3 runs\n") and "from an earlier run: 2" in printed.out
     assert printed.err == "warning: sequence 00 failed\n"
@@ -64,15 +64,15 @@ def test_a_signal_waits_for_the_end_of_a_step(number, status, capsys):
             signal.raise_signal(number)
             steps.append(step)
 
-    assert messages.run(main) == status
+    assert program.run(main) == status
     assert steps == [0] and capsys.readouterr().err.count("stopped") == 1
 
 
 def test_a_signal_outside_of_steps_stops_at_once():
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    assert messages.run(lambda: signal.raise_signal(signal.SIGINT)) == 130
+    assert program.run(lambda: signal.raise_signal(signal.SIGINT)) == 130
 
 
 def test_an_ignored_signal_stays_ignored():
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    assert messages.run(lambda: signal.raise_signal(signal.SIGTERM)) == 0
+    assert program.run(lambda: signal.raise_signal(signal.SIGTERM)) == 0

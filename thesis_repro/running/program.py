@@ -1,4 +1,4 @@
-"""What a run says and how it ends: messages, the summary, errors in one line, Ctrl-C."""
+"""What a program says and how it ends: messages, the summary, errors in one line, Ctrl-C."""
 
 import ctypes
 import logging

@@ -10,7 +10,7 @@ import pandas as pd
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.odometry import THESIS, metrics
-from thesis_repro.running import messages, results
+from thesis_repro.running import program, provenance
 from thesis_repro.study import compare, jobs, runner, sources, worth
 from thesis_repro.study.sources import Source
 
@@ -80,11 +80,11 @@ class Study:
             scale_gate=self.scale_gate,
             masked_settings=self.masked_settings,
         )
-        with results.claimed(folder):
+        with provenance.claimed(folder):
             settings = {"scale_gate": self.scale_gate, **self.masked_settings}
             if self.without_border:
                 settings["without_border"] = True
-            results.stage(folder, replace=False, frames=self.frames, **settings)
+            provenance.stage(folder, replace=False, frames=self.frames, **settings)
             first_jobs = jobs.first_jobs(
                 self.opened,
                 dict.fromkeys(self.estimators, self.widths),
@@ -142,7 +142,7 @@ class Study:
             raise InputError(f"{line}; no sequence with other poses is left to compare")
         lines = {name: f"{line}; sequence {name} is left out" for name, line in lines.items()}
         for line in lines.values():
-            messages.log.warning(line)
+            program.log.warning(line)
         return lines
 
     def worths(

@@ -1,4 +1,4 @@
-"""The page of a study: index.html beside its files. It needs no network or server."""
+"""The HTML of figures, tables and texts, and the page of a study, which needs no network."""
 
 import importlib.metadata
 import json
@@ -8,6 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import mistune
 from markupsafe import Markup
 
 from thesis_repro.report import texts
@@ -98,8 +99,8 @@ def text_content(text: str) -> Content:
     """Return a text in Markdown; the page folds the part after the first heading."""
     first, _, rest = text.partition("\n## ")
     if not rest:
-        return Content(texts.html(first))
-    return Content(texts.html(first), texts.html(f"## {rest}"))
+        return Content(from_markdown(first))
+    return Content(from_markdown(first), from_markdown(f"## {rest}"))
 
 
 def _table_content(files: list[Path]) -> Content:
@@ -110,7 +111,19 @@ def _table_content(files: list[Path]) -> Content:
     markdown = None
     if rows <= ROWS_SHOWN:
         markdown = text
-    return Content(texts.html(table), rows=rows, markdown=markdown)
+    return Content(from_markdown(table), rows=rows, markdown=markdown)
+
+
+class _Renderer(mistune.HTMLRenderer):
+    def heading(self, text: str, level: int, **attributes: Any) -> str:
+        # lower than the headings of the page
+        return super().heading(text, max(4, level + 1), **attributes)
+
+
+def from_markdown(text: str) -> Markup:
+    """Convert Markdown to HTML. HTML tags in the Markdown are shown as text."""
+    convert = mistune.create_markdown(renderer=_Renderer(escape=True), plugins=["table"])
+    return Markup(convert(text))
 
 
 def made_with() -> dict[str, Any]:

@@ -6,49 +6,49 @@ import os
 import pytest
 
 from thesis_repro.errors import InputError
-from thesis_repro.running import files, results
+from thesis_repro.running import files, provenance
 
 
 def test_a_stage_keeps_results_of_the_same_inputs(tmp_path):
-    folder = results.stage(tmp_path / "a", data="one", size=3)
+    folder = provenance.stage(tmp_path / "a", data="one", size=3)
     files.write_text(folder / "result", "kept")
-    assert results.stage(tmp_path / "a", size=3, data="one") == folder
+    assert provenance.stage(tmp_path / "a", size=3, data="one") == folder
     assert (folder / "result").exists()
-    before = results.made_from(folder)
-    results.stage(tmp_path / "a", data="other", size=3)
-    assert not (folder / "result").exists() and results.made_from(folder) != before
+    before = provenance.made_from(folder)
+    provenance.stage(tmp_path / "a", data="other", size=3)
+    assert not (folder / "result").exists() and provenance.made_from(folder) != before
     with pytest.raises(InputError, match="a: .*size"):
-        results.stage(folder, replace=False, data="other", size=4)
-    assert results.record(folder) == {"data": "other", "size": 3}
+        provenance.stage(folder, replace=False, data="other", size=4)
+    assert provenance.record(folder) == {"data": "other", "size": 3}
 
 
 def test_a_folder_with_other_files_is_refused_and_kept(tmp_path):
     (tmp_path / "letter.txt").write_text("mine")
     with pytest.raises(InputError, match=str(tmp_path)):
-        results.stage(tmp_path, data="one")
+        provenance.stage(tmp_path, data="one")
     assert [path.name for path in tmp_path.iterdir()] == ["letter.txt"]
-    (tmp_path / results.RECORD).write_text("[1, 2")  # a damaged record
+    (tmp_path / provenance.RECORD).write_text("[1, 2")  # a damaged record
     with pytest.raises(InputError, match="made-from.json: "):
-        results.stage(tmp_path, data="one")
+        provenance.stage(tmp_path, data="one")
 
 
 def test_results_of_other_inputs_move_aside_with_all_that_was_added(tmp_path, monkeypatch):
-    folder = results.stage(tmp_path / "a", size=3)
+    folder = provenance.stage(tmp_path / "a", size=3)
     monkeypatch.chdir(folder)
     for size in (3, 4, 5):
-        results.stage(".", size=size)  # "." has no name
+        provenance.stage(".", size=size)  # "." has no name
         files.write_text(folder / "in" / "result", f"result of {size}")
         (folder / "link").symlink_to("/nowhere")
         (folder / ".env").write_text(f"by hand, {size}")
-    results.stage(folder, size=5)
+    provenance.stage(folder, size=5)
     for path, size in ((folder, 5), (tmp_path / "a.old-1", 3), (tmp_path / "a.old-2", 4)):
-        assert results.record(path) == {"size": size} and (path / "link").is_symlink()
+        assert provenance.record(path) == {"size": size} and (path / "link").is_symlink()
         assert (path / "in" / "result").read_text() == f"result of {size}"
         assert (path / ".env").read_text() == f"by hand, {size}"
 
 
 def test_a_killed_move_of_old_results_is_finished(tmp_path, monkeypatch):
-    folder = results.stage(tmp_path / "out", size=3)
+    folder = provenance.stage(tmp_path / "out", size=3)
     for path in (folder / "result", folder / "in" / "result"):
         files.write_text(path, "old")
     rename = type(folder).rename
@@ -60,34 +60,34 @@ def test_a_killed_move_of_old_results_is_finished(tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(type(folder), "rename", killed)
         with pytest.raises(KeyboardInterrupt):
-            results.stage(folder, size=4)
-    assert results.record(folder) == {"size": 3}
-    results.stage(folder, size=4)
-    assert [path.name for path in folder.iterdir()] == [results.RECORD]
+            provenance.stage(folder, size=4)
+    assert provenance.record(folder) == {"size": 3}
+    provenance.stage(folder, size=4)
+    assert [path.name for path in folder.iterdir()] == [provenance.RECORD]
     assert len(list(tmp_path.glob("out.old-*/**/result"))) == 2
 
 
 def test_a_folder_is_locked_by_one_process(tmp_path):
     folder = tmp_path / "out"
-    with results.claimed(folder):
-        with results.claimed(folder):  # one process may lock it twice
-            results.stage(folder, size=3)
+    with provenance.claimed(folder):
+        with provenance.claimed(folder):  # one process may lock it twice
+            provenance.stage(folder, size=3)
         other = os.open(folder, os.O_RDONLY)  # as in another process
         with pytest.raises(BlockingIOError):
             fcntl.flock(other, fcntl.LOCK_EX | fcntl.LOCK_NB)
     fcntl.flock(other, fcntl.LOCK_EX)
     with pytest.raises(InputError, match="out: "):
-        results.stage(folder)
+        provenance.stage(folder)
     os.close(other)
-    results.stage(folder, size=4)
+    provenance.stage(folder, size=4)
 
 
 def test_temporary_files_of_a_killed_run_are_deleted(tmp_path):
-    folder = results.stage(tmp_path / "out", size=3)
+    folder = provenance.stage(tmp_path / "out", size=3)
     hidden = folder / "in" / ".hidden"
     for path in (hidden, files.temporary_path(folder / "in/a.png"), folder / "in/b"):
         files.write_text(path, "")
-    results.stage(folder, size=3)
+    provenance.stage(folder, size=3)
     assert {path.name for path in (folder / "in").iterdir()} == {".hidden", "b"}
 
 
@@ -95,19 +95,19 @@ def test_digests_change_with_the_bytes_and_the_names(tmp_path):
     paths = [tmp_path / "a", tmp_path / "b"]
     for path in paths:
         path.write_text("12")
-    first = results.digest_of_files(paths)
+    first = provenance.digest_of_files(paths)
     paths[1].write_text("21")
-    second = results.digest_of_files(paths)
+    second = provenance.digest_of_files(paths)
     paths[1] = paths[1].rename(tmp_path / "c")
-    assert len({first, second, results.digest_of_files(paths)}) == 3
+    assert len({first, second, provenance.digest_of_files(paths)}) == 3
     with pytest.raises(FileNotFoundError, match="attic"):
-        results.digest_of_code("thesis_repro.attic")
+        provenance.digest_of_code("thesis_repro.attic")
 
 
 def test_a_worker_with_other_files_or_packages_is_refused(tmp_path):
     record = {"size": 3, "versions": {"numpy": "1"}}
-    results.stage(tmp_path / "a", **record)
-    results.check_worker(tmp_path / "a", record, versions={"numpy": "1"})
+    provenance.stage(tmp_path / "a", **record)
+    provenance.check_worker(tmp_path / "a", record, versions={"numpy": "1"})
     for seen, here in (({"size": 4}, {}), (record, {"versions": {"numpy": "2"}})):
         with pytest.raises(InputError, match="a: "):
-            results.check_worker(tmp_path / "a", seen, **here)
+            provenance.check_worker(tmp_path / "a", seen, **here)

@@ -1,4 +1,4 @@
-"""The results of a study with the user's masks: findings, figures, tables and a page.
+"""The results of a study with the user's masks: findings, figures, tables and a html.
 
 Tables are also written as LaTeX and figures as PDF, for use in a paper.
 """
@@ -14,18 +14,18 @@ from matplotlib.figure import Figure
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.data.trajectories import write_kitti_poses, write_tum
 from thesis_repro.errors import one_line
-from thesis_repro.mask_files import LabelMasks, label_map_of
+from thesis_repro.mask_files import LabelMasks
 from thesis_repro.masks import MaskSettings
 from thesis_repro.odometry import THESIS, metrics
-from thesis_repro.odometry.odometry import detect
+from thesis_repro.odometry.loop import detect
 from thesis_repro.odometry.runs import inside
-from thesis_repro.report import comparison, findings, page, paths, style, worth
-from thesis_repro.running import results
+from thesis_repro.report import comparison, findings, html, paths, style, worth
+from thesis_repro.running import provenance
 from thesis_repro.running.files import write_text
 from thesis_repro.study import compare, controls, runner
 from thesis_repro.study.jobs import ESTIMATORS
+from thesis_repro.study.plan import RUNS, Study
 from thesis_repro.study.sources import KINDS, UNMASKED, FileMasks, Source, own_calls
-from thesis_repro.study.study import RUNS, Study
 
 PATHS = "paths"  # folder of the estimated paths
 DRAWN = ("masked", "keypoints")  # methods of what a user brings that acts on frames
@@ -43,10 +43,10 @@ def write(
 ) -> Path:
     """Write the findings, figures, tables and page of a `Study` into a folder.
 
-    Returns the page's path. warnings: lines for the top of the page. worths: of `Study.worths`.
+    Returns the page's path. warnings: lines for the top of the html. worths: of `Study.worths`.
     """
     # `thesis-repro synthesize` leaves a record beside the KITTI folder of an embedded world
-    world = results.record(study.kitti.resolve().parent) or {}
+    world = provenance.record(study.kitti.resolve().parent) or {}
     embedded = "train_images" in world
     data = f"KITTI folder {study.kitti.name}"
     if embedded:
@@ -79,7 +79,7 @@ def write(
     }
     if worths is not None:
         numbers["worth"] = worth.table(worths)
-        results.write_table(folder / "worth_runs.csv", worths)
+        provenance.write_table(folder / "worth_runs.csv", worths)
     for name, rows in numbers.items():
         text = latex(rows)
         if name == "errors":
@@ -90,7 +90,7 @@ def write(
     numbers["runs"] = runs.round(6)  # hundreds of pages in LaTeX
     names = style.save_all(figures, numbers, folder, note)
     widths = sorted(runs["dilation_width"].dropna().astype(int).unique())
-    text = page.build_study(
+    text = html.build_study(
         folder,
         [("text", "findings"), *names],
         study=study,
@@ -102,15 +102,15 @@ def write(
         changed=changed,
         widths=widths,
     )
-    write_text(folder / page.PAGE, text)
-    return folder / page.PAGE
+    write_text(folder / html.PAGE, text)
+    return folder / html.PAGE
 
 
 @style.applied()
 def write_worths(study: Study, worths: pd.DataFrame, folder: Path) -> Path:
     """Write the worths of a study without ground truth, which has no errors; return the table."""
     note = one_line(f"KITTI folder {study.kitti.name}, without ground truth")
-    results.write_table(folder / "worth_runs.csv", worths)
+    provenance.write_table(folder / "worth_runs.csv", worths)
     style.save_all({"worth": worth.figure(worths)}, {"worth": worth.table(worths)}, folder, note)
     return folder / "worth.md"
 
@@ -197,7 +197,7 @@ def figure_sources(study: Study, runs: pd.DataFrame) -> Figure:
         else:
             masks = source.masks(sequence, study.shown_width)
             if isinstance(masks, LabelMasks):
-                label_maps.append(label_map_of(masks, index))
+                label_maps.append(masks.label_map(index))
                 colors = style.label_colors(label_maps[-1], frame)
                 style.show_image(first, colors, f"{source.name}: label map")
             mask = masks[index]

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 from cv2 import INTER_NEAREST, resize
 
-from thesis import ablations, artefacts, audit_rows, domain_gap, section_4_2, timing
+from thesis import ablations, artefacts, audit_of_tables, domain_gap, timing
 from thesis.audit import measurement
 from thesis_repro.data import cityscapes
 from thesis_repro.data.cityscapes import ID, read_label_map
@@ -42,20 +42,18 @@ def measure(
     """
     labels = artefacts.needed("labels", "05_prediction")
     ablated = ablations.measure(
-        drives, labels, settings.build / "audit", processes=settings.jobs, repetitions=repetitions
+        drives, labels, settings.build / "audit", repetitions, settings.jobs
     )
     artefacts.write_text("ablations.csv", ablated.to_csv(index=False))
     tracks = [ablations.tracks(drive, masks_by_name(drive, labels), pairs) for drive in drives]
-    measurements = [
-        *audit_rows.of_shares(boundaries(drives, labels, pairs)),
-        *audit_rows.of_ablations(ablated),
-        *audit_rows.of_tracks(pd.concat(tracks, ignore_index=True)),
-        *audit_rows.of_shares(right_pixels(settings, drives, labels)),
+    return [
+        *audit_of_tables.of_shares(boundaries(drives, labels, pairs)),
+        *audit_of_tables.of_ablations(ablated),
+        *audit_of_tables.of_tracks(pd.concat(tracks, ignore_index=True)),
+        *audit_of_tables.of_shares(right_pixels(settings, drives, labels)),
         *of_earlier_notebooks(settings, len(drives)),
+        *([] if settings.uses_shipped_model else of_training(settings)),
     ]
-    if not settings.uses_shipped_model:
-        measurements += of_training(settings)
-    return measurements
 
 
 def boundaries(drives: list[Sequence], labels: Path, pairs: int) -> pd.DataFrame:
@@ -65,14 +63,11 @@ def boundaries(drives: list[Sequence], labels: Path, pairs: int) -> pd.DataFrame
     """
     rows = []
     for drive in drives:
-        thin_folder = true_labels(drive.root, drive.name)
-        if not thin_folder.is_dir():
-            thin_folder = labels / drive.name
+        own, exact = labels / drive.name, true_labels(drive.root, drive.name)
         for index in range(0, len(drive), max(1, len(drive) // pairs)):
             name = drive.frame_paths[index].name
-            label_map = read_label_map(labels / drive.name / name)
-            thin_map = read_label_map(thin_folder / name)
-            shares = ablations.boundaries(label_map, drive.size)
+            thin_map = read_label_map((exact if exact.is_dir() else own) / name)
+            shares = ablations.boundaries(read_label_map(own / name), drive.size)
             shares |= ablations.thin_boundaries(thin_map, drive.size)
             rows.append({"sequence": drive.name, "frame": index} | shares)
     return pd.DataFrame(rows)
@@ -98,12 +93,10 @@ def right_pixels(settings: Settings, drives: list[Sequence], labels: Path) -> pd
     for drive in drives:
         whole = Sequence(settings.kitti, drive.name).subset(settings.sizes.frames).subset(FRAMES)
         true_folder = true_labels(settings.kitti, drive.name)
-        for index, path in enumerate(whole.frame_paths):
-            if (true_folder / path.name).is_file():
-                predicted = read_label_map(labels / drive.name / path.name)
-                exact = read_label_map(true_folder / path.name)
-                shares = right_shares(predicted, exact, whole.frame(index))
-                rows.append({"sequence": drive.name, "frame": index} | shares)
+        for index, name in enumerate(whole.label_names if true_folder.is_dir() else ()):
+            predicted = read_label_map(labels / drive.name / name)
+            shares = right_shares(predicted, read_label_map(true_folder / name), whole.frame(index))
+            rows.append({"sequence": drive.name, "frame": index} | shares)
     return pd.DataFrame(rows)
 
 
@@ -119,15 +112,14 @@ def right_shares(predicted: np.ndarray, exact: np.ndarray, frame: np.ndarray) ->
     rim[margin:-margin, margin:-margin] = False
     small, road = np.isin(exact, SMALL), exact == ID["road"]
     dark = road & (frame < SHADOW * np.median(frame[road]))
-    pairs = {
-        ("rim", "inside"): (rim, ~rim),
-        ("small", "large"): (small, ~small),
-        ("dark", "lit"): (dark, road & ~dark),
-    }
     shares: dict[str, float] = {}
-    for names, areas in pairs.items():
-        if areas[0].any():
-            shares |= {name: 100 * right[area].mean() for name, area in zip(names, areas)}
+    for name, area, other, rest in (
+        ("rim", rim, "inside", ~rim),
+        ("small", small, "large", ~small),
+        ("dark", dark, "lit", road & ~dark),
+    ):
+        if area.any():
+            shares |= {name: 100 * right[area].mean(), other: 100 * right[rest].mean()}
     return shares
 
 
@@ -137,26 +129,24 @@ def of_earlier_notebooks(settings: Settings, count: int) -> list[dict[str, Any]]
         pd.read_csv(artefacts.needed(f"{name}.csv", "08_results"), dtype={"sequence": str})
         for name in ("runs", "shuffled_runs")
     )
-    measurements = audit_rows.of_study(runs, shuffled)
+    measurements = audit_of_tables.of_study(runs, shuffled)
     found_again = pd.read_csv(artefacts.needed("found_again.csv", "06_keypoint_masks"))
     text = "keypoints not found again in the next frame"
     for _, kind, _, share in found_again.itertuples():
         measurements.append(measurement("73", text, share, "%", metric=kind))
-    for row in domain_gap.label_map_quality(settings.build):
-        if row["domain"] == domain_gap.FRAMES:
-            recall, frames = 100 * row["sky_recall"], round(row["images"] / count)
-            measurements.append(measurement("46", "recall of the sky", recall, "%", frames=frames))
-    return measurements + of_times(timing.folder(settings))
+    quality = domain_gap.label_map_quality(settings.build)
+    for row in quality[quality["domain"] == domain_gap.FRAMES].itertuples() if len(quality) else ():
+        recall, frames = 100 * row.sky_recall, round(row.images / count)
+        measurements.append(measurement("46", "recall of the sky", recall, "%", frames=frames))
+    return measurements + of_times(settings)
 
 
-def of_times(folder: Path) -> list[dict[str, Any]]:
+def of_times(settings: Settings) -> list[dict[str, Any]]:
     """Return rows 16, 47 and 49, from the times that notebook 08 used."""
-    seconds = pd.read_csv(folder / "seconds.csv", dtype={"sequence": str})
-    savings = pd.DataFrame(
-        {name: section_4_2.time_savings(rows) for name, rows in seconds.groupby("sequence")}
-    )
-    saved = savings[savings.index.isin(audit_rows.WIDTHS)].mean()
-    stages = pd.read_csv(folder / "budget.csv")
+    seconds, stages = (timing.recorded(settings, name) for name in ("seconds", "budget"))
+    by_sequence = seconds.groupby("sequence")
+    savings = pd.DataFrame({name: timing.time_savings(rows) for name, rows in by_sequence})
+    saved = savings.reindex(audit_of_tables.WIDTHS).mean()
     totals = stages.groupby("method")["milliseconds"].sum()
     whole = totals.drop(UNMASKED) / totals[UNMASKED]
     timed_on = {"data": f"timed on {stages['processor'].iloc[0]}"}
@@ -175,21 +165,22 @@ def of_times(folder: Path) -> list[dict[str, Any]]:
 def of_training(settings: Settings) -> list[dict[str, Any]]:
     """Return rows 7, 8, 24 and 44, from the training data and the network of notebook 04."""
     pair = cityscapes.pairs(settings.cityscapes, "train")[0]
-    listed = [stems(path.parent) for path in (pair.image, pair.label)]
-    mismatched = [image != label for image, label in zip(*listed)]
+    listed = zip(stems(pair.image.parent), stems(pair.label.parent))
+    mismatched = [image != label for image, label in listed]
     data = artefacts.needed("data", "01_load_images_and_labels")
     image, label_map = (np.load(data / f"train_{kind}.npy")[0] for kind in ("images", "labels"))
     equal = [transformed_alike(image, label_map, seed) for seed in range(5)]
-    model = training.load_model(artefacts.needed("model/model.keras", "04_training"))
+    model = artefacts.used_model()
     model.compile(loss=training.total_loss())
     images, label_maps = (np.load(data / f"validation_{x}.npy")[:16] for x in ("images", "labels"))
     blur, full = augmentation.validation_augmenter(), augmentation.training_augmenter(len(image))
+    blurred, transformed = (
+        [validation_loss(model, (images, label_maps), each, seed) for seed in range(2)]
+        for each in (blur, full)
+    )
     history = pd.read_csv(settings.build / "model" / "history.csv")["val_loss"]
     pairs = "pairs that the listings of this machine (Linux or other) would mismatch"
     alike = "random transforms in which both give the same"
-    blurred, transformed = (
-        validation_losses(model, (images, label_maps), each) for each in (blur, full)
-    )
     return [
         measurement("8", pairs, 100 * np.mean(mismatched), "%"),
         measurement("24", alike, 100 * np.mean(equal), "%"),
@@ -218,13 +209,10 @@ def transformed_alike(image: np.ndarray, label_map: np.ndarray, seed: int) -> bo
     return np.array_equal(one_hot, augmentation.one_hot(ids, classes))
 
 
-def validation_losses(
-    model: Any, held_out: tuple[np.ndarray, np.ndarray], transforms: A.Compose
-) -> list[float]:
-    """Return the losses of a network on two augmented copies of images with label maps."""
-    losses = []
-    for seed in range(2):
-        copies, maps = augmentation.augment_set(*held_out, transforms, seed)
-        encoded = augmentation.one_hot(maps, cityscapes.N_CLASSES)
-        losses.append(model.evaluate(copies.astype(np.float32), encoded, batch_size=4, verbose=0))
-    return losses
+def validation_loss(
+    model: Any, held_out: tuple[np.ndarray, np.ndarray], transforms: A.Compose, seed: int
+) -> float:
+    """Return the loss of a network on an augmented copy of images with label maps."""
+    copies, maps = augmentation.augment_set(*held_out, transforms, seed)
+    encoded = augmentation.one_hot(maps, cityscapes.N_CLASSES)
+    return model.evaluate(copies.astype(np.float32), encoded, batch_size=4, verbose=0)

@@ -12,7 +12,7 @@ import pandas as pd
 from scipy.stats import binomtest
 
 from thesis import section_4_2
-from thesis.audit import METRICS, geometric_mean, measurement, ratio, share
+from thesis.audit import METRICS, measurement, ratio, share
 from thesis.captions import REPORTED
 from thesis_repro.data.cityscapes import LABELS
 from thesis_repro.study import compare
@@ -45,12 +45,12 @@ def over(
     for a table without them.
     """
     ratios = []
-    for metric in metrics:
+    for metric in (each for each in metrics if each in runs):
         for estimator in [""] if metric == "mean_keypoints" else estimators:
-            pair = of(runs, estimator), of(reference, estimator)
-            if metric in runs:
-                texts = {"metric": METRICS[metric], "estimator": estimator}
-                ratios.append(ratio(row, quantity, compare.ratios(*pair, metric), **texts))
+            by_sequence = compare.ratios(of(runs, estimator), of(reference, estimator), metric)
+            ratios.append(
+                ratio(row, quantity, by_sequence, metric=METRICS[metric], estimator=estimator)
+            )
     return ratios
 
 
@@ -62,8 +62,8 @@ def over_thesis(row: str, quantity: str, runs: pd.DataFrame, estimator: str) -> 
 
 def over_raw(quantity: str, runs: pd.DataFrame, metric: str) -> dict[str, Any]:
     """Return row 15's ratio of an error after an alignment to the RMSE of the same runs."""
-    runs = of(runs, "refined")
-    ratios = compare.ratios(runs, runs.assign(**{metric: runs["rmse"]}), metric)
+    refined = of(runs, "refined")
+    ratios = compare.ratios(refined.assign(rmse=refined[metric]), refined, "rmse")
     return ratio("15", quantity, ratios, metric=METRICS["rmse"], estimator="refined")
 
 
@@ -91,11 +91,9 @@ def of_method(runs: pd.DataFrame, name: str, widths: Iterable[int | None] = ()) 
 def with_frames(measurements: list[dict[str, Any]], table: pd.DataFrame) -> list[dict[str, Any]]:
     """Return the measurements that have values, with the table's mean number of frames."""
     sequences = table.groupby("sequence")
-    if "frames" in table:
-        frames = round(sequences["frames"].first().mean())
-    else:
-        frames = round(sequences["frame"].nunique().mean())
-    return [{**measurement, "frames": frames} for measurement in measurements if measurement["n"]]
+    frames = sequences["frames"].first() if "frames" in table else sequences["frame"].nunique()
+    mean = round(frames.mean())
+    return [{**measurement, "frames": mean} for measurement in measurements if measurement["n"]]
 
 
 def of_reported() -> list[dict[str, Any]]:
@@ -106,13 +104,13 @@ def of_reported() -> list[dict[str, Any]]:
     classes = REPORTED["training"]["classes"]
     parameters = REPORTED["figure_a1_model_summary"]["rows"][-1]["params"]
     best_widths = best["dilation_width"].isin(WIDTHS).sum()
-    beyond = "images said to be augmented, beyond those of the training split"
     reduction = "reduction factor of keypoints"
+    beyond = "images said to be augmented, beyond those of the training split"
     measurements = [
         *_of_changes("RMSE"),
         *_of_changes("MAE"),
         measurement("3", f"{reduction}, mean of Table 4.1", 2000 / keypoints.mean(), "ratio"),
-        geometric_mean("3", f"{reduction}, geometric mean over sequences", factors),
+        ratio("3", f"{reduction}, geometric mean over sequences", factors, geometric_mean=True),
         measurement(
             "3", "sequences with keypoints reduced 3 times or more", sum(factors >= 3), "sequences"
         ),
@@ -140,23 +138,25 @@ def of_reported() -> list[dict[str, Any]]:
 def _of_changes(metric: str) -> list[dict[str, Any]]:
     """Return rows 1, 4 and 41 for one metric."""
     change = CHANGES[metric]
-    improved = int((change < 0).sum())
+    ratios = 1 + change / 100
     # the best of as many widths as there are is better by chance nearly always
-    by_chance = WIDTHS_TRIED / (WIDTHS_TRIED + 1)
+    by_chance = len(change) * WIDTHS_TRIED / (WIDTHS_TRIED + 1)
     on_average = "sequences improved on average if masks did nothing"
     probability = (
         "probability of no more improved sequences if masks did nothing, 15 independent widths"
     )
-    ratios = 1 + change / 100
-    larger = (change > 0).sum()
+    of_ratios = ratio(
+        "1", "geometric mean of the error ratios", ratios, geometric_mean=True, metric=metric
+    )
+    larger, improved = (change > 0).sum(), (change < 0).sum()
     return [
         measurement("1", "sum of eleven percentages", change.sum(), "%", metric=metric),
         measurement("1", "mean of the percentages", change, "%", metric=metric),
         measurement("1", "median of the percentages", change.median(), "%", metric=metric),
-        geometric_mean("1", "geometric mean of the error ratios", ratios, metric=metric),
+        of_ratios,
         measurement("4", "sequences with a larger error", larger, "sequences", metric=metric),
         measurement("41", "sequences improved", improved, "sequences", metric=metric),
-        measurement("41", on_average, len(change) * by_chance, "sequences", metric=metric),
+        measurement("41", on_average, by_chance, "sequences", metric=metric),
         measurement("41", probability, 100 * _sign_test(metric, WIDTHS_TRIED), "%", metric=metric),
     ]
 
@@ -219,18 +219,16 @@ def _of_best_widths(
     masked, every = compare.of_method(runs, "masked"), compare.of_method(runs, "baseline")
     stability = section_4_2.stability(masked, every)
     by_width = masked.groupby(["sequence", "dilation_width"])[["rmse", "mae"]].mean()
-    by_rmse = by_width["rmse"].groupby("sequence").idxmin()
-    by_mae = by_width["mae"].groupby("sequence").idxmin()
-    rmse_ratios = by_width["rmse"][by_mae].to_numpy() / by_width["rmse"][by_rmse].to_numpy()
-    widths = section_4_2.best_widths(masked)["dilation_width"]
+    chosen = by_width.groupby("sequence").idxmin()  # by either error
+    rmse_of = {error: by_width["rmse"][chosen[error]].to_numpy() for error in chosen}
+    other_width = (chosen["rmse"] != chosen["mae"]).sum()
+    nine = section_4_2.best_widths(masked)["dilation_width"].isin(WIDTHS).sum()
     best_of = "masks of the best width over all keypoints"
-    by_other = "sequences with another best width by MAE"
     by_both = "width chosen by MAE over width chosen by RMSE"
-    nine = widths.isin(WIDTHS).sum()
     return [
         ratio("2", f"{best_of}, same runs", compare.ratios(best, every, "rmse"), metric="RMSE"),
-        ratio("31", by_both, rmse_ratios, metric="RMSE"),
-        measurement("31", by_other, (by_rmse != by_mae).sum(), "sequences"),
+        ratio("31", by_both, rmse_of["mae"] / rmse_of["rmse"], metric="RMSE"),
+        measurement("31", "sequences with another best width by MAE", other_width, "sequences"),
         measurement("35", "sequences with a best width of 9 to 11", nine, "sequences"),
         ratio("2", f"{best_of}, other repetitions", stability["elsewhere"], metric="RMSE"),
         share("2", "pairs of repetitions with the same best width", stability["same_best"]),
@@ -263,10 +261,11 @@ def _of_alike_widths(masked: pd.DataFrame, shuffled: pd.DataFrame) -> list[dict[
         "probability of no more improved sequences in the thesis if masks did nothing and so few "
         "widths were independent"
     )
-    independent = "widths that count as independent (Kish)"
     return [
         measurement("41", alike, correlation, metric="RMSE"),
-        measurement("41", independent, widths, "widths", metric="RMSE"),
+        measurement(
+            "41", "widths that count as independent (Kish)", widths, "widths", metric="RMSE"
+        ),
         measurement("41", so_few, chance, "%", metric="RMSE"),
     ]
 
@@ -348,20 +347,20 @@ def _of_parallax(text: str, name: str, runs: pd.DataFrame) -> list[dict[str, Any
 def of_tracks(tracks: pd.DataFrame) -> list[dict[str, Any]]:
     """Return the lines of row 32 that follow from the table of `ablations.tracks`."""
     every = of_method(tracks, "all keypoints")
-    texts = {
-        "masks": "masks",
-        "true label maps": "masks of true label maps",
-        "exact boundaries": "masks of exact boundaries",
-        "random lines": "random lines",
-    }
+    columns = ("residual", "outliers", "fields")
     measurements = []
-    for name, text in texts.items():
+    for name, text in TRACKED.items():
         rows = of_method(tracks, name)
-        columns = ("residual", "outliers", "fields")
         measurements += over("32", f"{text} over all keypoints", rows, every, columns, [""])
     return with_frames(measurements, tracks)
 
 
+TRACKED = {  # method of the table of tracks: what is measured
+    "masks": "masks",
+    "true label maps": "masks of true label maps",
+    "exact boundaries": "masks of exact boundaries",
+    "random lines": "random lines",
+}
 SHARES = {  # column of a table: row of the audit, what is measured
     "invented": ("10", "pixels with an id of no class within 2 pixels"),
     "lost": ("11", "boundary pixels lost"),

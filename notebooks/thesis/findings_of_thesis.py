@@ -1,0 +1,69 @@
+"""What the findings of a run of notebook 8 say beyond those of a study."""
+
+from typing import Any
+
+import pandas as pd
+
+from thesis import domain_gap, section_4_2, trainings
+from thesis_repro.report import findings, style, texts
+from thesis_repro.running.files import write_text
+from thesis_repro.running.settings import Settings
+from thesis_repro.study import compare
+from thesis_repro.study.jobs import CONTROL_WIDTH
+
+
+def notes(settings: Settings, runs: pd.DataFrame, mask_settings: dict[str, Any]) -> tuple[str, str]:
+    """Return what stands at the foot of figures and tables, and how to name the thesis's numbers.
+
+    mask_settings: those that are not the thesis's.
+    """
+    changed = ", ".join(f"{name} {value}" for name, value in mask_settings.items())
+    note = f"{settings.data_note}; masks: {changed}" if changed else settings.data_note
+    if settings.kitti_is_embedded:
+        return note, "thesis, another data set"
+    frames = runs.groupby("sequence")["frames"].first()
+    lengths = ", ".join(f"{name} ({count} frames)" for name, count in frames.items())
+    return f"{note}; {lengths}", "thesis, complete KITTI sequences"
+
+
+def write(
+    settings: Settings,
+    runs: pd.DataFrame,
+    compared: pd.DataFrame,
+    shuffled: pd.DataFrame,
+    note: str,
+) -> str:
+    """Write the findings of a run (see `findings.text`) beside the figures, and return them.
+
+    compared: `compare.comparisons` of the runs. shuffled: see `section_4_2`.
+    """
+    procedure = section_4_2.procedure(runs, shuffled)
+    spans = "{:+.1f} to {:+.1f}".format
+    shown = {
+        "error": procedure["error"],
+        "mean change (%)": procedure["mean"].round(1),
+        "median (%)": procedure["median"].round(1),
+        "improved": procedure["improved"].astype(str) + f" of {procedure['sequences'][0]}",
+        "with a failed run": procedure["failed"],
+        "means of all repetitions (%)": map(spans, procedure["lowest"], procedure["highest"]),
+        "null: mean (%)": procedure["null_mean"].round(1),
+        "null: middle (%)": map(spans, procedure["null_low"], procedure["null_high"]),
+        "null: improved": procedure["null_improved"].round(1),
+    }
+    quality = domain_gap.label_map_quality(settings.build).round(3)
+    quality = quality.filter(["domain", "images", "classes", "mean_iou", "seen"])
+    of_trainings = trainings.summary() if settings.figures_in_git else pd.DataFrame()
+    more = texts.render(
+        "findings_of_thesis.md.j2",
+        widths=procedure["widths"][0],
+        studies=procedure["studies"][0],
+        level=compare.LEVEL,
+        procedure=style.markdown(pd.DataFrame(shown)),
+        label_maps=[style.markdown(table) for table in (quality,) if len(table)],
+        trainings=[style.markdown(table) for table in (of_trainings,) if len(table)],
+        count=trainings.read()["training"].nunique(),
+        thesis_width=CONTROL_WIDTH,
+    )
+    text = findings.text(runs, compared, note, settings.kitti_is_embedded, more)
+    write_text(settings.figures / "findings.md", text)
+    return text
