@@ -153,7 +153,7 @@ def measure(
 ) -> pd.DataFrame:
     """Run every ablation on every sequence with ESTIMATORS, see `run_choices`.
 
-    Columns: sequence, method, estimator, repetition, those of `runner.measures`, and sim3 (RMSE in
+    Columns: sequence, method, estimator, repetition, those of `runner.run_all`, and sim3 (RMSE in
     metres after an alignment with scale).
     """
     table = run_choices(
