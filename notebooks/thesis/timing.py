@@ -98,20 +98,6 @@ def measure(sequence: Sequence, model: Any, width: int = CONTROL_WIDTH) -> pd.Da
     return pd.concat(tables).rename_axis("stage").reset_index()[columns]
 
 
-def table_budget(measured: pd.DataFrame) -> pd.DataFrame:
-    """Return the milliseconds of each stage for one frame, one column a method.
-
-    The last rows have their sum and the frames a second. measured: of `measure`.
-    """
-    table = measured.pivot(index="stage", columns="method", values="milliseconds")
-    table = table.loc[measured["stage"].unique(), measured["method"].unique()]
-    total = table.sum()
-    summary = pd.DataFrame({"all stages (ms)": total, "frames a second": 1000 / total}).T
-    stages = table.round(2).rename("{} (ms)".format)
-    table = pd.concat([stages, summary.round(1)])
-    return table.rename_axis("stage", axis=0).rename_axis(None, axis=1).reset_index()
-
-
 def recorded(settings: Settings, name: str, measured: pd.DataFrame | None = None) -> pd.DataFrame:
     """Return the timings that are drawn, with a column for the processor.
 
