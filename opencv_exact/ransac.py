@@ -87,7 +87,7 @@ class _Solution(NamedTuple):
 
 
 def find_essential_matrix(
-    current: np.ndarray, previous: np.ndarray, threshold: float, probability: float
+    current: np.ndarray, previous: np.ndarray, threshold: float, probability: float = 0.999
 ) -> tuple[np.ndarray | None, np.ndarray | None]:
     """Essential matrix and inliers, (E, mask), with the bits of OpenCV's own search.
 

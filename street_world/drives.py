@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from thesis_repro.data import kitti
+from thesis_repro.data import geometry
 
 STEP = 0.25  # metres between the stored points of a track
 # metres over which the curvature changes, because a driver turns the wheel gradually
@@ -265,7 +265,7 @@ def scaled_camera(name: str, scale: float) -> tuple[tuple[int, int], np.ndarray]
     Whole coordinates are pixel centres, so half a pixel is added before and subtracted after
     scaling.
     """
-    camera = kitti.CAMERAS[name]
+    camera = geometry.CAMERAS[name]
     width, height = round(camera.width * scale), round(camera.height * scale)
     x, y = width / camera.width, height / camera.height
     centre_x = (camera.cx + 0.5) * x - 0.5

@@ -4,6 +4,12 @@ import fcntl
 import os
 from contextlib import contextmanager
 
+# Tests run in as many processes as there are cores, so threads of a library would only compete. The
+# variables are read when the libraries are loaded, here and in the commands that tests start.
+os.environ |= dict.fromkeys(
+    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"), "1"
+)
+
 from thesis_repro import segmentation  # noqa: F401  sets what TensorFlow reads at its import
 
 # isort: split
@@ -12,16 +18,19 @@ import numpy as np
 import pytest
 import trials
 
-# the files that take longest, longest first
+# The files that take longest, longest first. The evidence waits for the notebooks, which the first
+# file executes.
 LONGEST = (
     "test_executed.py",
-    "test_edits.py",
-    "test_install.py",
     "test_training.py",
-    "test_dask.py",
     "test_prediction.py",
+    "test_dask.py",
     "test_odometry.py",
     "test_study.py",
+    "test_own_sources.py",
+    "test_runner.py",
+    "test_edits.py",
+    "test_tools.py",
 )
 # fixtures that take seconds
 SLOW_FIXTURES = {
@@ -31,6 +40,7 @@ SLOW_FIXTURES = {
     "kitti_real",
     "camvid_real",
     "reference",
+    "executed",
 }
 
 
@@ -93,7 +103,23 @@ def small_world(tmp_path_factory):
     from thesis_repro.running.settings import PROFILES
 
     with _shared_folder(tmp_path_factory, "small_world") as folder:  # rendered once
-        dataset.write(folder, **PROFILES["smoke"].world, seed=0)
+        dataset.write(folder, **PROFILES["smoke"].world, seed=0, jobs=1)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def executed(small_world, tmp_path_factory):
+    """A folder with build and figures of a run in which every notebook was executed.
+
+    Tests must not change it.
+    """
+    import executing
+
+    with _shared_folder(tmp_path_factory, "executed") as folder:
+        if not folder.exists():
+            executing.execute(folder, small_world)
+            (folder / "done").touch()
+        assert (folder / "done").exists(), "a notebook failed in another process"
     return folder
 
 

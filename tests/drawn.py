@@ -80,8 +80,15 @@ class Watch:
 
         @functools.wraps(save_figure)
         def checked(figure, folder, name, note):
-            self.report(*(f"{name}: {fault}" for fault in ["saved", *problems(figure)]))
+            faults = ["saved"]
+
+            def draw():  # in place of the first drawing by save_figure, which takes a while
+                del figure.draw_without_rendering
+                faults.extend(problems(figure))
+
+            figure.draw_without_rendering = draw
             save_figure(figure, folder, name, note)
+            self.report(*(f"{name}: {fault}" for fault in faults))
 
         def remembered(draw, **sliders):
             self.with_sliders.append((draw, sliders))

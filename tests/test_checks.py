@@ -101,18 +101,18 @@ def test_steps_that_nothing_drives_are_named(tiny_kitti, times, speed, scale, sa
     poses.write_text("".join(f"1 0 0 0 0 1 0 0 0 0 1 {scale * index}\n" for index in range(4)))
     if speed:
         poses.unlink()
-    lines = checks.of_sequence(Sequence(tiny_kitti, "00", speed=speed))
+    lines = checks.sequence_warnings(Sequence(tiny_kitti, "00", speed=speed))
     assert len(lines) == len(said)
     assert all(text in line for text, line in zip(said, lines))
 
 
 def test_a_centre_far_from_the_middle_and_steps_that_were_left_out(tiny_kitti):
-    assert checks.of_sequence(Sequence(tiny_kitti, "00")) == []
+    assert checks.sequence_warnings(Sequence(tiny_kitti, "00")) == []
     (tiny_kitti / "sequences/00/calib.txt").write_text("P0: 50 0 37 0 0 50 24 0 0 0 1 0\n")
-    (line,) = checks.of_sequence(Sequence(tiny_kitti, "00"))
+    (line,) = checks.sequence_warnings(Sequence(tiny_kitti, "00"))
     assert line.startswith("sequence 00: calib.txt") and "37, 24" in line
-    assert checks.of_run("00", frames=100, failed=50, dropped=9) == []
-    failed, dropped = checks.of_run("00", 100, 51, 10, 0.1)
+    assert checks.run_warnings("00", frames=100, failed=50, dropped=9) == []
+    failed, dropped = checks.run_warnings("00", 100, 51, 10, 0.1)
     assert "51 of 100" in failed and "10 of 100" in dropped and "--scale-gate" in dropped
 
 
@@ -143,5 +143,5 @@ def test_masks_that_cannot_be_right(tiny_kitti, tmp_path, kind, picture, options
     if kind == "labels":
         source = LabelMasks(folder, sequence, 3, MaskSettings(**options))
         assert "label maps hold" in checks.describe_masks(source, sequence)
-    warnings = checks.of_masks(source)
+    warnings = checks.mask_warnings(source)
     assert [warning in line for line in warnings] == ([True] if warning else [])

@@ -52,7 +52,7 @@ def test_the_first_training_is_that_of_the_comparison():
             compared["over"] == "all keypoints"
         )
         (line,) = compared[is_same].to_dict("records")
-        for column, name in (("se3", "aligned ATE"), ("rotation", "rotation error a frame")):
+        for column, name in (("se3", "aligned ATE"), ("rotation", "rotational RPE, 1 frame")):
             ends = [getattr(row, f"{column}_{end}") for end in ("ratio", "low", "high")]
             assert line[name] == "{:.2f} ({:.2f}-{:.2f})".format(*ends)
 

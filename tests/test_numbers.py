@@ -19,7 +19,7 @@ from thesis_repro.running.settings import ROOT
 from thesis_repro.study import compare
 
 REFINED, THESIS = "refined estimator", "thesis's estimator"
-ATE, ROTATION = "aligned ATE", "rotation error a frame"
+ATE, ROTATION = "aligned ATE", "rotational RPE, 1 frame"
 SHORT = {ATE: "se3", ROTATION: "rotation", "RMSE": "rmse", REFINED: "refined", THESIS: "thesis"}
 ALL = "all keypoints"
 MASKS = "masks, width 10"
@@ -282,7 +282,8 @@ def claims_of_readme():
 def claims_of_answer():
     return [
         (
-            "rotation error of a step is {} times that with all keypoints (95 % interval {}-{};",
+            "rotation error of a step (rotational RPE, 1 frame) is {} times that with all keypoints"
+            " (95 % interval {}-{};",
             compared(ROTATION),
         ),
         ("The error of the path (aligned ATE) is {} times ({}-{}).", compared(ATE)),
@@ -309,7 +310,7 @@ def claims_of_answer():
         ("leave {} keypoints instead of {}.", [compared_number(MASKS), total()]),
         ("| aligned ATE (decides) | {} ({}-{}) | {} of 8 | {} ({}-{}) | {} of 8 |", both(ATE)),
         (
-            "| rotation error a frame (decides) | {} ({}-{}) | {} of 8 | {} ({}-{}) | {} of 8 |",
+            "| rotational RPE, 1 frame (decides) | {} ({}-{}) | {} of 8 | {} ({}-{}) | {} of 8 |",
             both(ROTATION),
         ),
         (
@@ -377,7 +378,7 @@ def claims_of_answer():
         ("{} % of the keypoints lie on movable things", [moving("share (%)")]),
         (
             "the rotation error is {} times as large",
-            [moving("rotation error a frame without them, ratio")],
+            [moving("rotational RPE, 1 frame without them, ratio")],
         ),
         ("rotation error of {} of {} steps", failing_steps()[:2]),
         ("step, {} keypoints agree with the motion, and {} without masks", failing_steps()[2:]),
@@ -437,7 +438,7 @@ FACTS = {
         3 to 5 times fewer; 5 to 10 % of; 95 % intervals; rows 47 and 16; Figure A.1; GPL-3.0;
         BY-NC-SA 3.0; CC BY-NC-SA 3.0""",
     "docs/answer.md": """
-        00, 01, 02, 05, 06 and 07; drives 0005 and 0095; width 10; street 01; 6 of 11.;
+        rotational RPE, 1 frame; 00, 01, 02, 05, 06 and 07; drives 0005 and 0095; width 10; street 01; 6 of 11.;
         best of 15; all 16 runs; One of 400 keypoints; Of 400 keypoints; and 6 or fewer;
         the 15 count; failed runs of 40; In drive 0005; more than 0.15 degrees; All 23 are;
         on 01, a ramp; 16 x 5 fields; on 07 are; by 180 degrees; failed runs of 32; 90 % interval;

@@ -17,7 +17,7 @@ import numpy as np
 
 from thesis_repro.data import cityscapes, kitti
 from thesis_repro.errors import InputError, one_line
-from thesis_repro.mask_files import LabelMasks, MaskFolder, label_map_of
+from thesis_repro.mask_files import LabelMasks, MaskFolder
 from thesis_repro.masks import coverage
 from thesis_repro.running import files, program
 from thesis_repro.running.settings import read_settings
@@ -72,7 +72,7 @@ def check_kitti(root: Path) -> list[str]:
             f"sequence {name}: {len(sequence)} frames of {width}x{height}; with ground truth: "
             f"{sequence.has_truth}; with times: {sequence.has_times}"
         )
-        print("\n".join(f"  {one_line(line)}" for line in [fact, *of_sequence(sequence)]))
+        print("\n".join(f"  {one_line(line)}" for line in [fact, *sequence_warnings(sequence)]))
         checksums: dict[int, int] = {}
 
         def read(index: int, sequence: Any = sequence, checksums: Any = checksums) -> None:
@@ -134,22 +134,23 @@ def main(path: Path) -> int:
     check without problems. Returns the exit code. Raises InputError if a file is missing.
     """
     settings = read_settings()
-    roots: list[Path | None] = [None, None, settings.kitti_semantic]
+    kitti_root = None if settings.kitti_is_embedded else settings.kitti
+    cityscapes_root = None if settings.cityscapes_is_embedded else settings.cityscapes
     used: list[Path] = []
-    if not settings.kitti_is_embedded:
-        roots[0] = settings.kitti
-        for name in kitti.sequences(settings.kitti):
-            used += kitti.Sequence(settings.kitti, name).subset(settings.sizes.frames).files
-    if not settings.cityscapes_is_embedded:
-        roots[1] = settings.cityscapes
-    for root, split in ((roots[1], "train"), (roots[1], "val"), (roots[2], "train")):
-        if root:
-            used += chain(*[pair[1:] for pair in cityscapes.pairs(root, split)])
+    for name in kitti.sequences(kitti_root) if kitti_root else ():
+        used += kitti.Sequence(kitti_root, name).subset(settings.sizes.frames).files
+    splits = (
+        (cityscapes_root, "train"),
+        (cityscapes_root, "val"),
+        (settings.kitti_semantic, "train"),
+    )
+    for root, split in splits:
+        used += chain(*[pair[1:] for pair in cityscapes.pairs(root, split)]) if root else ()
     lines = [f"{file} {file.stat().st_size} {file.stat().st_mtime_ns}\n" for file in used]
     checked = ascii("".join(lines))  # names may hold any bytes
     if path.is_file() and path.read_text(encoding="utf-8") == checked:
         return 0
-    if not report(*roots):
+    if not report(kitti_root, cityscapes_root, settings.kitti_semantic):
         return 1
     files.write_text(path, checked)
     return 0
@@ -158,7 +159,7 @@ def main(path: Path) -> int:
 # Warnings, one line each: "place: what is wrong"
 
 
-def of_sequence(sequence: kitti.Sequence) -> list[str]:
+def sequence_warnings(sequence: kitti.Sequence) -> list[str]:
     """Warn of a principal point far from the middle of the frames, and of impossible steps."""
     height, width = sequence.size
     u, v = sequence.intrinsics[:2, 2]
@@ -169,15 +170,14 @@ def of_sequence(sequence: kitti.Sequence) -> list[str]:
             f"sequence {sequence.name}: {sequence.calibration_path.name} has the centre {u:g}, {v:g}, far "
             f"from the middle of frames of {width}x{height} pixels; it must belong to frames of this size"
         )
-    return warnings + _of_steps(sequence)
+    return warnings + _step_warnings(sequence)
 
 
-def _of_steps(sequence: kitti.Sequence) -> list[str]:
+def _step_warnings(sequence: kitti.Sequence) -> list[str]:
     """Warn of steps longer or faster than what drives, and of gaps in the times."""
     intervals = np.diff(sequence.times)
-    lengths, unit = sequence.assumed_steps[1:], "times in seconds, and the speed in metres a second"
+    lengths, unit = kitti.scales(sequence)[1:], "times in seconds, and the speed in metres a second"
     if sequence.has_truth:
-        lengths = np.linalg.norm(np.diff(sequence.poses[:, :3, 3], axis=0), axis=1)
         unit = "true positions in metres, and times in seconds"
     impossible = lengths > MAX_STEP
     if sequence.has_times:
@@ -201,7 +201,7 @@ def _of_steps(sequence: kitti.Sequence) -> list[str]:
     return warnings
 
 
-def of_run(
+def run_warnings(
     name: str, frames: int, failed: int, dropped: int = 0, scale_gate: float = 0.1
 ) -> list[str]:
     """Warn if many steps of a run failed or were dropped.
@@ -209,52 +209,52 @@ def of_run(
     name: of the sequence. frames, failed, dropped: numbers of frames, of steps with a flag, and of
     steps that were no longer than the scale gate (metres), so that their motion was left out.
     """
-    warnings = []
-    if failed > frames / 2:
-        warnings.append(
-            f"sequence {name}: {failed} of {frames} frames have a flag; do frames, calibration and "
-            "poses fit together?"
-        )
-    if dropped >= MAX_DROPPED * frames:
-        warnings.append(
-            f"sequence {name}: {dropped} of {frames} steps are no longer than the scale gate of "
-            f"{scale_gate:g} m, so their motion and rotation were left out; --scale-gate 0 takes all"
-        )
-    return warnings
+    told = [
+        (
+            failed > frames / 2,
+            f"{failed} of {frames} frames have a flag; do frames, calibration and poses fit together?",
+        ),
+        (
+            dropped >= MAX_DROPPED * frames,
+            f"{dropped} of {frames} steps are no longer than the scale gate of {scale_gate:g} m, so their "
+            "motion and rotation were left out; --scale-gate 0 takes all",
+        ),
+    ]
+    return [f"sequence {name}: {text}" for applies, text in told if applies]
 
 
-def of_masks(source: LabelMasks | MaskFolder) -> list[str]:
+def mask_warnings(source: LabelMasks | MaskFolder) -> list[str]:
     """Warn of what is certainly wrong with masks, seen on MASK_SAMPLES of them.
 
     Raises InputError if one of them cannot be read.
     """
-    folder = source.paths[0].parent
     shares = [coverage(source[index]) for index in _sampled(source)]
-    ids = np.arange(cityscapes.N_CLASSES)
+    ids, has_label_ids = np.arange(cityscapes.N_CLASSES), False
     if isinstance(source, LabelMasks):
-        ids = np.flatnonzero(_class_shares(source))
-    if len(ids) == 1:
-        return [
-            f"{folder}: label maps hold nothing but {cityscapes.LABELS[ids[0]].name}; the network that "
-            "made them does not work, or has other ids"
-        ]
-    if isinstance(source, LabelMasks) and source.settings.ids == "labels":
-        if ids.max() < len(cityscapes.TRAINED):
-            return [
-                f"{folder}: label maps hold no id above {ids.max()}, so no sky, vegetation or cars; "
-                "--ids train reads train ids"
-            ]
-        if ids.max() == cityscapes.ID["license plate"]:
-            return [
-                f"{folder}: label maps hold id {ids.max()}, a license plate, but a garage in KITTI-360; "
-                "--ids FILE gives ids the names that are meant"
-            ]
-    if min(shares) < MIN_SHARE or min(shares) == 1:
-        return [
-            f"{folder}: masks keep {min(shares):.1%} to {max(shares):.1%} of the frames; --invert "
-            "inverts ready-made masks"
-        ]
-    return []
+        ids, has_label_ids = np.flatnonzero(_class_shares(source)), source.settings.ids == "labels"
+    told = [
+        (
+            len(ids) == 1,
+            f"label maps hold nothing but {cityscapes.LABELS[ids[0]].name}; the network that made them "
+            "does not work, or has other ids",
+        ),
+        (
+            has_label_ids and ids.max() < len(cityscapes.TRAINED),
+            f"label maps hold no id above {ids.max()}, so no sky, vegetation or cars; --ids train reads "
+            "train ids",
+        ),
+        (
+            has_label_ids and ids.max() == cityscapes.ID["license plate"],
+            f"label maps hold id {ids.max()}, a license plate, but a garage in KITTI-360; --ids FILE gives "
+            "ids the names that are meant",
+        ),
+        (
+            min(shares) < MIN_SHARE or min(shares) == 1,
+            f"masks keep {min(shares):.1%} to {max(shares):.1%} of the frames; --invert inverts ready-made "
+            "masks",
+        ),
+    ]
+    return [f"{source.paths[0].parent}: {text}" for applies, text in told if applies][:1]
 
 
 def describe_masks(source: LabelMasks | MaskFolder, sequence: kitti.Sequence) -> str:
@@ -277,7 +277,7 @@ def _sampled(source: LabelMasks | MaskFolder) -> list[int]:
 
 def _class_shares(source: LabelMasks) -> np.ndarray:
     """Return the share of each label id, (N_CLASSES,), in the sampled label maps."""
-    label_maps = [label_map_of(source, index).ravel() for index in _sampled(source)]
+    label_maps = [source.label_map(index).ravel() for index in _sampled(source)]
     counts = np.bincount(np.concatenate(label_maps), minlength=cityscapes.N_CLASSES)
     return counts / counts.sum()
 

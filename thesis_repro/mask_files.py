@@ -12,7 +12,7 @@ import numpy as np
 from thesis_repro.data import label_ids
 from thesis_repro.data.kitti import Sequence, check_size
 from thesis_repro.errors import InputError
-from thesis_repro.masks import THESIS_MASKS, MaskSettings, check, forget, keypoint_mask
+from thesis_repro.masks import THESIS_MASKS, MaskSettings, check_width, forget, keypoint_mask
 from thesis_repro.running import provenance
 from thesis_repro.running.files import listed, progress, read_gray, write_png
 
@@ -40,15 +40,20 @@ class LabelMasks:
         self.size = sequence.size
         self.dilation_width = dilation_width
         self.settings = settings
-        check(dilation_width, self.size, settings)
+        if settings.has_width:
+            check_width(dilation_width, self.size)
 
     def __len__(self) -> int:
         return len(self.paths)
 
-    def __getitem__(self, index: int) -> np.ndarray:
+    def label_map(self, index: int) -> np.ndarray:
+        """Label map of frame `index`, in label ids."""
         path = self.paths[index]
         status = os.stat(path)
-        label_map = _read_once(path, self.settings.ids, status.st_mtime_ns, status.st_size)
+        return _read_once(path, self.settings.ids, status.st_mtime_ns, status.st_size)
+
+    def __getitem__(self, index: int) -> np.ndarray:
+        label_map = self.label_map(index)
         return keypoint_mask(label_map, self.size, self.dilation_width, self.settings)
 
     def record(self) -> list[Any]:
@@ -61,11 +66,6 @@ class LabelMasks:
         for path in [path for path in self.paths if (path, ids) not in known]:
             label_ids.read(path, ids)
             known.add((path, ids))
-
-
-def label_map_of(masks: LabelMasks, index: int) -> np.ndarray:
-    """Label map of frame `index`, in label ids."""
-    return label_ids.read(masks.paths[index], masks.settings.ids)
 
 
 @lru_cache(maxsize=2)  # masks of several settings, and controls, share label maps

@@ -26,8 +26,7 @@ import pandas as pd
 
 from thesis_repro import mask_files, masks, odometry
 from thesis_repro.data.kitti import Sequence
-from thesis_repro.odometry import THESIS, Odometry
-from thesis_repro.odometry import odometry as page
+from thesis_repro.odometry import THESIS, Odometry, loop
 from thesis_repro.odometry.estimators import refined
 from thesis_repro.running import program
 from thesis_repro.running.files import write_text
@@ -51,9 +50,9 @@ def seconds(work, clock=time.perf_counter):
 
 def bare_calls(previous, frame, points, intrinsics):
     """Return the OpenCV calls of one step of the thesis's odometry, functions without arguments."""
-    calls = page.OPENCV
+    calls = loop.OPENCV
     tracked, followed = calls.track(previous, frame, points)
-    old, new = (page.normalise(corners[followed], intrinsics) for corners in (points, tracked))
+    old, new = (loop.normalise(corners[followed], intrinsics) for corners in (points, tracked))
     matrix, _ = calls.find_essential_matrix(new, old, THESIS.threshold)
     return [
         lambda: calls.track(previous, frame, points),

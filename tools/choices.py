@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 
 from thesis import few_keypoints
+from thesis_repro.odometry.estimators import COMPARED
 from thesis_repro.report import texts
 from thesis_repro.report.worth import cell
 from thesis_repro.study import compare, methods
@@ -91,7 +92,8 @@ def _failed(runs: pd.DataFrame) -> pd.Series:
 def _errors(chosen: pd.DataFrame, reference: pd.DataFrame) -> dict:
     """Return failures, ratios of errors to all keypoints, and rule 5, for each estimator."""
     row, no_worse = {}, []
-    for estimator, title in ESTIMATORS.items():
+    for estimator in COMPARED:
+        title = ESTIMATORS[estimator]
         of_choice = chosen[chosen["estimator"] == estimator]
         of_all = reference[reference["estimator"] == estimator]
         failing, failing_of_all = map(_failing_streets, (of_choice, of_all))
@@ -99,16 +101,20 @@ def _errors(chosen: pd.DataFrame, reference: pd.DataFrame) -> dict:
         passes = failing <= failing_of_all
         for error, margin in few_keypoints.MARGINS.items():
             ratios = compare.ratios(of_choice, of_all, error)
-            numbers = compare.typical_ratio(ratios)
-            ratio, low, high = (texts.number(numbers[name]) for name in ("ratio", "low", "high"))
-            interval = "" if np.isnan(numbers["low"]) else f" ({low}-{high})"
-            text = f"{ratio}{interval}, {numbers['above']} of {numbers['n']} above 1"
-            row[f"{few_keypoints.ERRORS[error]}, {title}"] = text
+            row[f"{compare.METRICS[error]}, {title}"] = ratio_text(ratios)
             passes &= few_keypoints.within(ratios, margin)["no_worse"]
         row[f"no worse (rule 5), {title}"] = "yes" if passes else ""
         no_worse.append(passes)
     row["no worse (rule 5)"] = "yes" if all(no_worse) else ""
     return row
+
+
+def ratio_text(ratios: pd.Series) -> str:
+    """Return the typical ratio of streets as text, such as "1.09 (0.98-1.32), 6 of 8 above 1"."""
+    numbers = compare.typical_ratio(ratios)
+    ratio, low, high = (texts.number(numbers[name]) for name in ("ratio", "low", "high"))
+    interval = "" if np.isnan(numbers["low"]) else f" ({low}-{high})"
+    return f"{ratio}{interval}, {numbers['above']} of {numbers['n']} above 1"
 
 
 def _failing_streets(runs: pd.DataFrame) -> int:

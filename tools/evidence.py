@@ -17,6 +17,8 @@ import choices
 import failures
 import label_quality
 import reasons
+import refined_widths
+import saturation
 from thesis import few_keypoints
 from thesis_repro import mask_files, masks
 from thesis_repro.data import kitti
@@ -91,6 +93,9 @@ def write(settings, folder, others=()):
         settings.jobs,
     )
     why = reasons.measure(sequences, [Source(labels)], jobs.CONTROL_WIDTH)
+    of_widths = refined_widths.measure(
+        sequences, labels, settings.sizes.widths, settings.build / "refined_widths", settings.jobs
+    )
     streets = _streets(sequences)
     provenance.sweep(folder)
     for name in KEPT:
@@ -101,6 +106,7 @@ def write(settings, folder, others=()):
             "few_keypoints": few_keypoints.figure(few, times),
             "label_quality": label_quality.figure(qualities),
             "worth": report_worth.figure(worths),
+            "saturation": saturation.figure(worths),
             "reasons": reasons.figure(why, worths),
         },
         {
@@ -110,7 +116,9 @@ def write(settings, folder, others=()):
             "few_keypoints": few_keypoints.summary(few, times),
             "worth": report_worth.table(worths),
             "choices": choices.table(runs, few_runs, worths),
+            "saturation": saturation.table(worths),
             "reasons": reasons.table(why, worths),
+            "refined_widths": refined_widths.table(of_widths),
         },
         folder,
         note,
@@ -118,6 +126,8 @@ def write(settings, folder, others=()):
     tables = {name: _read(settings, name) for name in RUNS} | {
         "few_keypoints_runs": few_runs,
         "worth_runs": worths,
+        "reasons_runs": why,
+        "refined_widths_runs": of_widths,
     }
     for name, rows in tables.items():
         # six digits are enough: shuffling the matched points changes more

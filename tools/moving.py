@@ -21,7 +21,7 @@ from thesis_repro import masks
 from thesis_repro.data import kitti
 from thesis_repro.data.cityscapes import ID, read_label_map
 from thesis_repro.errors import InputError
-from thesis_repro.odometry import odometry
+from thesis_repro.odometry.loop import detect, track
 from thesis_repro.report import style, texts
 from thesis_repro.running import program
 from thesis_repro.running.settings import ROOT, cores
@@ -57,8 +57,8 @@ def tracks(sequence, labels):
     rows = []
     for index, name in enumerate(sequence.label_names[:-1]):
         frame, following = sequence.frame(index), sequence.frame(index + 1)
-        points = odometry.detect(frame)
-        moved, tracked = odometry.track(frame, following, points)
+        points = detect(frame)
+        moved, tracked = track(frame, following, points)
         motion = np.linalg.inv(sequence.poses[index]) @ sequence.poses[index + 1]
         distances = sequence.intrinsics[0, 0] * ablations.sampson_distances(
             points[tracked], moved[tracked], motion, sequence.intrinsics

@@ -19,6 +19,7 @@ from thesis_repro.study import compare, worth
 EVERY = 12  # frames
 # choices with a name in the figure, few enough for it; the others are plain dots
 NAMED = ("spread keypoints", "random keypoints", "exact class boundaries", "random lines", "masks")
+LINE = 7  # points from one name to the next
 REASONS = {
     "fields": "fields of 42 pixels with a keypoint",
     "height": "standard deviation of the rows (px)",
@@ -104,13 +105,25 @@ def figure(reasons, worths) -> Figure:
     for panel, motion in zip(panels, ("direction", "rotation"), strict=True):
         values = numbers[f"{motion}_fields"]
         panel.plot(fields, values, "o", color=style.MASKED, markersize=5)
-        for choice in NAMED:
-            place = (fields[choice], values[choice])
-            panel.annotate(choice, place, (4, 2), textcoords="offset points", fontsize=6)
         panel.axhline(1, color="black", linewidth=0.8)
         style.ratio_axis(panel.yaxis, numbers[["direction_fields", "rotation_fields"]].to_numpy())
         panel.set_xlim(fields.min() - 5, 1.25 * fields.max())
         panel.set_title(motion)
         panel.set_xlabel("fields of 42 pixels with one of 400 keypoints")
     panels[0].set_ylabel("typical worth")
+    drawing.draw_without_rendering()  # places of the panels
+    for panel, motion in zip(panels, ("direction", "rotation"), strict=True):
+        _annotate(panel, fields[[*NAMED]], numbers.loc[[*NAMED], f"{motion}_fields"])
     return drawing
+
+
+def _annotate(panel, x, y):
+    """Name points beside them, one name lower if it would touch the one above."""
+    points = 72 / panel.figure.dpi
+    above = np.inf
+    for name in y.sort_values(ascending=False).index:
+        place = x[name], y[name]
+        height = panel.transData.transform(place)[1] * points
+        above = min(height + 2, above - LINE)
+        offset = (4, above - height)
+        panel.annotate(name, place, offset, textcoords="offset points", fontsize=6)

@@ -18,7 +18,7 @@ from thesis_repro.data.kitti import Sequence
 from thesis_repro.mask_files import MaskFolder
 from thesis_repro.odometry import THESIS, Odometry, run_many, scales
 from thesis_repro.odometry.estimators import refined
-from thesis_repro.odometry.odometry import normalise
+from thesis_repro.odometry.loop import normalise
 
 FOLDER = Path(__file__).parent.parent / "tests" / "reference"
 ESTIMATORS = {"thesis": THESIS, "refined": replace(THESIS, estimator=refined)}

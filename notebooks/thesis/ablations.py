@@ -21,7 +21,7 @@ from thesis_repro.data.kitti import Sequence
 from thesis_repro.mask_files import LabelMasks
 from thesis_repro.masks import MaskSettings
 from thesis_repro.odometry import THESIS, estimators, keypoints, metrics
-from thesis_repro.odometry.odometry import detect, normalise, track
+from thesis_repro.odometry.loop import detect, normalise, track
 from thesis_repro.running import provenance
 from thesis_repro.study.jobs import CONTROL_WIDTH, Job
 from thesis_repro.study.methods import Choice
@@ -153,7 +153,7 @@ def measure(
 ) -> pd.DataFrame:
     """Run every ablation on every sequence with ESTIMATORS, see `run_choices`.
 
-    Columns: sequence, method, estimator, repetition, those of `runner.measures`, and sim3 (RMSE in
+    Columns: sequence, method, estimator, repetition, those of `runner.run_all`, and sim3 (RMSE in
     metres after an alignment with scale).
     """
     table = run_choices(

@@ -20,7 +20,7 @@ METRICS = {  # column of a table: its name in the audit
     "rmse": "RMSE",
     "mae": "MAE",
     "mean_keypoints": "keypoints",
-    "rotation": "rotation error a frame",
+    "rotation": compare.METRICS["rotation"],
     "in_turns": "rotation error in turns",
     "on_straights": "rotation error on straights",
     "se3": "aligned ATE",

@@ -4,7 +4,7 @@ How it is decided. These rules were fixed before the runs that the tables show, 
 prototype's results on the same streets were known:
 
 1. A choice is compared with all keypoints, with the same estimator. The errors are the aligned ATE
-   and the rotation error a frame, as they are for every run, lost or not.
+   and the rotational RPE over one frame, as they are for every run, lost or not.
 2. The ratio is formed as in `study.compare`. (It was the geometric mean with Student's t at first;
    see there why it changed. No answer of rules 4 and 5 changed with it.)
 3. Runs that failed are counted beside it, not mixed in: those with a step that fails or a turn that
@@ -222,7 +222,7 @@ def figure(rows: pd.DataFrame, times: pd.DataFrame | None = None) -> Figure:
         for panel, estimator in zip(panel_row, ESTIMATORS, strict=True):
             shown = rows[(rows["error"] == error) & (rows["estimator"] == estimator)]
             _draw_curves(panel, shown, near)
-            title = f"{ERRORS[error]}, {ESTIMATORS[estimator]}"
+            title = f"{compare.METRICS[error]}, {ESTIMATORS[estimator]}"
             panel.set_title(f"the same, {NEAR[0]} to {NEAR[1]}" if near else title)
             if not near:
                 style.ratio_axis(panel.yaxis, rows[["ratio", "low", "high"]].to_numpy())

@@ -10,7 +10,7 @@ import numpy as np
 
 from thesis_repro import masks
 from thesis_repro.odometry import THESIS
-from thesis_repro.odometry.odometry import detect, track
+from thesis_repro.odometry.loop import detect, track
 
 SAME = 2.0  # pixels: a keypoint within this distance of a tracked keypoint is the same one
 

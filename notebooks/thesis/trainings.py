@@ -8,14 +8,14 @@ import pandas as pd
 from thesis_repro.running import provenance
 from thesis_repro.running.files import listed
 from thesis_repro.running.settings import ROOT, Settings
-from thesis_repro.study import jobs
+from thesis_repro.study import compare, jobs
 
 TABLE = ROOT / "figures" / "trainings.csv"
 NUMBERS = {  # columns of the table: their names in `summary`
     "keypoints": "keypoints with masks",
     "mean_iou": "mean IoU of the label maps",
-    "se3_ratio": "ratio of the aligned ATE",
-    "rotation_ratio": "ratio of the rotation error a frame",
+    "se3_ratio": f"ratio of the {compare.METRICS['se3']}",
+    "rotation_ratio": f"ratio of the {compare.METRICS['rotation']}",
     "rmse_ratio": "ratio of the RMSE",
     "table_4_2_mean": "mean of Table 4.2 (%), best of 15 widths",
     "table_4_2_improved": "sequences improved in Table 4.2",

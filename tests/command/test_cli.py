@@ -18,6 +18,7 @@ from thesis_repro.command.options import named as named_options
 from thesis_repro.data import cityscapes
 from thesis_repro.data.trajectories import read_poses
 from thesis_repro.masks.kinds import KINDS, Kind
+from thesis_repro.odometry.estimators import COMPARED, ESTIMATORS, Entry
 from thesis_repro.running import provenance
 from thesis_repro.running.files import write_png
 
@@ -63,7 +64,7 @@ def test_a_command_shows_two_valid_examples(name):
 
 
 def test_written_masks_give_the_same_path_as_label_maps(small_world, small_labels, tmp_path):
-    where = ["--kitti", small_world / "kitti", "--sequence", "00"]
+    where = ["--kitti", small_world / "kitti", "--sequence", "00", "--frames", 6]
     labels = ["--labels", small_labels / "00", "--dilation"]
     corrected = "--boundaries exact --symmetric --without-movable --classes road --margin 4"
     paths = []
@@ -118,12 +119,9 @@ def test_public_names():
     assert tr.build_unet((32, 32, 1), 35, 2).output_shape == (None, 32, 32, 35)
 
 
-def test_tensorflow_is_loaded_on_first_use():
-    code = (
-        "import sys, thesis_repro as tr; tr.Sequence, tr.keypoint_mask, tr.Odometry, tr.THESIS, tr.run; "
-        "assert 'tensorflow' not in sys.modules and 'keras' not in sys.modules; tr.build_unet; "
-        "assert 'keras' in sys.modules"
-    )
+def test_tensorflow_is_not_loaded_before_it_is_used():
+    names = "tr.Sequence, tr.keypoint_mask, tr.Odometry, tr.THESIS, tr.run"
+    code = f"import sys, thesis_repro as tr; {names}; assert not {{'tensorflow', 'keras'}} & {{*sys.modules}}"
     subprocess.run([sys.executable, "-W", "ignore", "-c", code], check=True)
 
 
@@ -184,6 +182,14 @@ def test_a_new_kind_of_mask_is_one_entry(monkeypatch, tiny_kitti, tmp_path):
     assert run("masks", *where, "--keep", "left", "--output", tmp_path / "masks") == 0
     mask = cv2.imread(str(tmp_path / "masks/000002.png"), cv2.IMREAD_UNCHANGED)
     assert mask[:, : mask.shape[1] // 2].all() and not mask[:, mask.shape[1] // 2 :].any()
+
+
+def test_a_new_estimator_runs_in_a_study_only_if_it_is_asked_for(monkeypatch):
+    monkeypatch.setitem(ESTIMATORS, "mine", Entry("my estimator", None))
+    parser = build_parser(cli.COMMANDS, ["study"])
+    words = ["study", "--kitti", "kitti", "--labels", "mine", "--output", "out"]
+    assert parser.parse_args(words).estimator == list(COMPARED) == ["thesis", "refined"]
+    assert parser.parse_args([*words, "--estimator", "mine"]).estimator == ["mine"]
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ import pytest
 
 from thesis_repro import checks, odometry
 from thesis_repro.command import cli
-from thesis_repro.data import kitti, kitti_raw
+from thesis_repro.data import kitti, kitti_raw, layout
 from thesis_repro.errors import InputError
 
 
@@ -40,7 +40,7 @@ def test_colour_jpeg_frames_are_read_as_gray_with_the_colour_camera(tiny_kitti):
         )
         path.unlink()
     sequence = kitti.Sequence(tiny_kitti, "0")  # "0" stands for "00"
-    assert sequence.name == kitti.locate(tiny_kitti, "0")[1].name == "00" and kitti.sequences(
+    assert sequence.name == layout.locate(tiny_kitti, "0")[1].name == "00" and kitti.sequences(
         tiny_kitti
     ) == ["00"]
     assert np.array_equal(sequence.intrinsics, [[60, 0, 30], [0, 60, 20], [0, 0, 1]])

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from thesis_repro.data import kitti, trajectories
+from thesis_repro.data import geometry, kitti, trajectories
 from thesis_repro.errors import InputError
 
 # the same examples in every run, and no time limits
@@ -62,7 +62,7 @@ def test_any_text_as_poses(path, text):
         assert poses.shape[1:] == (4, 4) and len(poses) and np.isfinite(poses).all()
         assert (
             np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max()
-            <= trajectories.ROTATION_TOLERANCE
+            <= geometry.ROTATION_TOLERANCE
         )
         assert (np.linalg.det(rotations) > 0).all() and (poses[:, 3] == [0, 0, 0, 1]).all()
 

@@ -23,6 +23,7 @@ def build(small_world, small_labels, tmp_path, monkeypatch):
     """The folder of a run on the small world, with the label maps of notebook 5."""
     values = {
         "PROFILE": "smoke",
+        "FRAMES": 5,
         "KITTI": small_world / "kitti",
         "CITYSCAPES": small_world / "cityscapes",
         "BUILD": tmp_path,

@@ -1,66 +1,48 @@
-"""The notebooks are executed once, on the smallest profile, as they are in git."""
+"""What the notebooks show and write, and which of them `make figures` executes, and when."""
 
 import os
 import re
+import shutil
+import subprocess
 
 import nbformat
 import pytest
 from cells import NOTEBOOKS, named
-from drawn import END
-from making import EXECUTED, FIGURES, make_figures
-from nbclient import NotebookClient
+from executing import run_of
 
 from thesis import page
 from thesis_repro.running.settings import PREFIX, ROOT, read_settings
 
 pytestmark = pytest.mark.notebooks
+FIGURES = [
+    *(f"figure_2_{n:02d}" for n in range(1, 13)),
+    *(f"figure_3_{n:02d}" for n in range(1, 7)),
+    *(f"figure_4_{n:02d}" for n in range(1, 18)),
+    "figure_a_01",
+]
 TABLES = ["table_3_1", "table_3_2", "table_4_1", "table_4_2", "table_4_3"]
 WITHOUT_DATA = {*(f"figure_2_{n:02d}" for n in (1, 3, 4, 5, 6, 7)), "figure_3_04", "figure_a_01"}
 # a call that saves a figure, at the start of a line
 SAVED = re.compile(r"^\w+\.save_figure\(", re.MULTILINE)
+# the number of a notebook in a command that executes it, in the output of make
+EXECUTED = re.compile(r"(?:nbconvert)[^\n]*? notebooks/(\d\d)_")
 
 
-def environment(build):
-    """Variables of a kernel: no setting of the Makefile but profile and folders."""
-    variables = {key: os.environ[key] for key in ("PATH", "HOME", "LANG") if key in os.environ}
-    folders = {f"{PREFIX}BUILD": str(build), f"{PREFIX}FIGURES": str(build.parent / "figures")}
-    startup = {"IPYTHONDIR": str(build.parent / "ipython"), "PYTHONPATH": str(ROOT)}
-    # without worker processes, which would each load what is compiled
-    return variables | folders | startup | {f"{PREFIX}PROFILE": "smoke", f"{PREFIX}JOBS": "1"}
-
-
-def execute(name, build, output):
-    """Execute a notebook in its folder by what nbconvert uses, and write it with its outputs.
-
-    This spares the start of nbconvert, three seconds each.
-    """
-    notebook = nbformat.read(ROOT / "notebooks" / name, 4)
-    notebook.cells.append(nbformat.v4.new_code_cell(END))
-    folder = {"metadata": {"path": str(ROOT / "notebooks")}}
-    client = NotebookClient(notebook, kernel_name="python3", resources=folder)
-    client.execute(env=environment(build) | {"WATCHED": name[:2]})
-    nbformat.write(notebook, output / name)
-
-
-@pytest.fixture(scope="module")
-def executed(tmp_path_factory):
-    """A folder with build and figures of a run in which every notebook was executed."""
-    folder = tmp_path_factory.mktemp("run")
-    run = folder / "build" / "embedded-smoke"
-    (run / "notebooks").mkdir(parents=True)
-    (run / "checked").touch()  # as if make had checked the data
-    # executed by every kernel
-    startup = folder / "ipython" / "profile_default" / "startup" / "watch.py"
-    startup.parent.mkdir(parents=True)
-    startup.write_text(
-        f"import sys\nsys.path.append({str(ROOT / 'tests')!r})\nfrom drawn import Watch\n"
-        f"Watch(get_ipython(), {str(folder)!r})\n"
+def make_figures(tmp_path, *options, root=ROOT, target="figures"):
+    # MAKEFLAGS would pass the options of an outer make on to this one
+    environment = {
+        name: value
+        for name, value in os.environ.items()
+        if not name.startswith(("MAKE", "MFLAGS", PREFIX))
+    }
+    folders = f"BUILD={tmp_path / 'build'}", f"FIGURES={tmp_path / 'figures'}"
+    return subprocess.run(
+        ["make", target, "PROFILE=smoke", *folders, "-o", ".venv/ready", *options],
+        cwd=root,
+        env=environment | {"PYTHONPATH": str(root)},
+        capture_output=True,
+        text=True,
     )
-    for name in NOTEBOOKS:
-        execute(name, folder / "build", run / "notebooks")
-        if name == NOTEBOOKS[0]:
-            (run / "drives").touch()  # as if make had rendered the drives
-    return folder
 
 
 def code_cells(executed, name):
@@ -103,7 +85,7 @@ def test_cells_and_package_agree_to_the_bit(executed):
 
 
 def test_the_page_shows_every_artefact(executed):
-    assert "41 of 41" in page.build(read_settings(environment(executed / "build")))
+    assert "41 of 41" in page.build(read_settings(run_of(executed)))
 
 
 @pytest.mark.parametrize(
@@ -142,3 +124,49 @@ def test_sliders_show_the_numbers_of_the_cells_above_after_all_cells(executed, n
         assert (
             re.search(pattern, shown)[1] == re.search(pattern, printed(executed, named(number)))[1]
         )
+
+
+def test_a_failing_notebook_does_not_stop_the_others(tmp_path):
+    """On a copy of the project with two small notebooks."""
+    root = tmp_path / "project"
+    for folder in ("thesis_repro", "street_world", "notebooks/thesis"):
+        shutil.copytree(ROOT / folder, root / folder, ignore=shutil.ignore_patterns("__pycache__"))
+    (root / ".venv").symlink_to(ROOT / ".venv")
+    for name in ("Makefile", "environment.txt", "pyproject.toml"):
+        shutil.copy(ROOT / name, root)
+    for name, code in (
+        ("01_one.ipynb", "print('by hand')"),
+        ("02_two.ipynb", "raise ValueError('labels: missing')"),
+    ):
+        nbformat.write(
+            nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(code)]),
+            root / "notebooks" / name,
+        )
+    failed = make_figures(tmp_path, root=root)
+    assert failed.returncode != 0 and "labels: missing" in failed.stderr
+    assert (tmp_path / "figures" / "embedded-smoke" / "index.html").is_file()
+    # hidden ones included
+    written = (tmp_path / "build" / "embedded-smoke" / "notebooks").glob("*.ipynb")
+    assert sorted(path.name for path in written) == ["01_one.ipynb"]
+
+
+def test_real_frames_alone_need_no_training(tmp_path, tiny_kitti):
+    options = f"KITTI={tiny_kitti}", f"RUN={tmp_path / 'run'}", "-n"
+    planned = make_figures(tmp_path, *options, target="notebooks")
+    assert planned.returncode == 0, planned.stderr
+    assert EXECUTED.findall(planned.stdout.replace("\\\n", "")) == [
+        "03",
+        "05",
+        "06",
+        "07",
+        "08",
+        "09",
+    ]
+
+
+def test_bad_data_stops_before_the_notebooks(tmp_path, tiny_kitti):
+    (tiny_kitti / "poses" / "00.txt").unlink()
+    failed = make_figures(tmp_path, f"KITTI={tiny_kitti}")
+    assert failed.returncode != 0 and "poses/00.txt" in failed.stderr
+    assert not list((tmp_path / "build").rglob("*.ipynb"))
+    assert "PROFIL: unknown setting" in make_figures(tmp_path, "PROFIL=smoke").stderr

@@ -26,8 +26,8 @@ from thesis_repro.odometry import (
     sharing,
 )
 from thesis_repro.odometry.estimators import ESTIMATORS, refined
-from thesis_repro.odometry.odometry import VoteOfAll, detect, normalise, track
-from thesis_repro.odometry.types import ROTATION_COLUMNS
+from thesis_repro.odometry.loop import VoteOfAll, detect, normalise, track
+from thesis_repro.odometry.step import ROTATION_COLUMNS
 
 SMALL = replace(THESIS, max_keypoints=500)  # quicker
 COUNTS = {
@@ -51,12 +51,19 @@ def separately(sequence, runs):
 
 
 @pytest.mark.real
-@pytest.mark.parametrize("make", [separately, odometry.run_many], ids=["opencv", "shared"])
-def test_agrees_with_pyslam_on_every_frame(kitti_real, reference, make):
-    first, other = Sequence(kitti_real, "00"), Sequence(kitti_real, "06")
-    masks = MaskFolder(reference / "masks_00", first)
-    results = make(first, {"00": (THESIS, None), "00_masked": (THESIS, masks)})
-    results |= make(other, {"06": (THESIS, None)})
+@pytest.mark.parametrize(
+    "make, runs",
+    [
+        (odometry.run_many, ["00", "00_masked"]),
+        (odometry.run_many, ["06"]),
+        (separately, ["06"]),
+        pytest.param(separately, ["00", "00_masked"], marks=pytest.mark.torture),  # 40 seconds
+    ],
+)
+def test_agrees_with_pyslam_on_every_frame(kitti_real, reference, make, runs):
+    sequence = Sequence(kitti_real, runs[0])
+    masks = {"00_masked": MaskFolder(reference / "masks_00", sequence)} if len(runs) > 1 else {}
+    results = make(sequence, {run: (THESIS, masks.get(run)) for run in runs})
     for run, result in results.items():
         expected, true = pd.read_csv(reference / f"{run}.csv"), Sequence(kitti_real, run[:2]).poses
         assert len(result.frames) == len(expected) == len(true) and result.flagged.empty
@@ -271,7 +278,7 @@ def test_bad_frames_are_flagged_and_keep_the_pose(drive, case):
 def test_too_large_turns_are_flagged_and_kept(drive, monkeypatch, estimator):
     few, settings = Changed(drive, frames=4), replace(THESIS, estimator=ESTIMATORS[estimator].make)
     plain = odometry.run(few, settings)
-    monkeypatch.setattr(odometry.odometry, "MAX_TURN", 0.05)
+    monkeypatch.setattr(odometry.loop, "MAX_TURN", 0.05)
     flagged = odometry.run(few, settings)
     assert plain.flagged.empty and set(flags(flagged).values()) == {"too large a turn"}
     np.testing.assert_array_equal(flagged.poses, plain.poses)

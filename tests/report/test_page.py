@@ -198,7 +198,7 @@ def test_markup_in_names_and_texts_is_escaped(run, tmp_path):
         assert link.startswith("#") or (settings.figures / unquote(link)).is_file(), link
 
 
-def test_the_page_in_git_is_made_from_what_is_in_git(run):
+def test_the_page_in_git_is_made_from_what_is_in_git():
     """After a change of docs/answer.md, a caption or a table: `make page`."""
     figures = ROOT / "figures"  # read, not written
     in_git = replace(read_settings({}), figures=figures)

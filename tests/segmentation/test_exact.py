@@ -165,6 +165,7 @@ def steps(model):
     batches = training.Batches([(images, labels)], 2, 0)
     loss = training.fused_loss(training.total_loss())
     model.compile(keras.optimizers.Adam(), loss, metrics=training.metrics())
+    model.optimizer.build(model.trainable_variables)  # or TensorFlow compiles the step twice
     yield lambda: model.fit(batches.dataset(), shuffle=False, verbose=0)
     yield lambda: model.evaluate(batches.dataset(), verbose=0)
     yield lambda: model.predict(images.astype(np.float32), verbose=0)

@@ -55,6 +55,7 @@ def prepared(sets=SETS, filters=2, rate=0.01, loss=None):
     model = network(filters)
     loss = training.fused_loss(loss or training.total_loss())
     model.compile(keras.optimizers.Adam(rate), loss, metrics=training.metrics())
+    model.optimizer.build(model.trainable_variables)  # or TensorFlow compiles the step twice
     augmented = augmentation.augment_set(*sets[:2], augmentation.training_augmenter(SIZE), 0)
     batches = training.Batches([sets[:2], augmented], 4, seed=0)
     return model, batches, training.Batches([sets[2:]], 4)

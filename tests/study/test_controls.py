@@ -12,7 +12,7 @@ from thesis import ablations, section_4_2
 from thesis_repro import mask_files, masks
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.odometry import THESIS, keypoints
-from thesis_repro.odometry.odometry import detect
+from thesis_repro.odometry.loop import detect
 from thesis_repro.study import compare, controls, methods, runner
 from thesis_repro.study.jobs import first_jobs
 from thesis_repro.study.sources import Source

@@ -14,13 +14,14 @@ from thesis_repro.data.kitti import Sequence
 from thesis_repro.data.trajectories import write_kitti_poses
 from thesis_repro.odometry import metrics
 from thesis_repro.report import study_report as report
-from thesis_repro.study import sources
+from thesis_repro.study import sources, worth
 from thesis_repro.study.plan import Study
 
 
 @pytest.fixture
-def street(tmp_path):
+def street(tmp_path, monkeypatch):
     """A root with the street of noise as sequences 00 and 01, and one mask for all frames."""
+    monkeypatch.setattr(worth, "MAX_STEPS", 1)  # the worth takes longest, and is tested elsewhere
     street, root = Street(12), tmp_path / "kitti"
     projection = np.column_stack([street.intrinsics, np.zeros(3)]).ravel().tolist()
     for name in ("00", "01"):
@@ -123,18 +124,15 @@ def test_own_functions_are_tried_before_the_study(street, text, said, capsys):
 def test_own_keypoints_are_drawn(street, capsys):
     path = street.parent / "own.py"
     path.write_text(DETECT.format(CORNERS))
-    code, out = study(street, "--keypoints", f"own={path}", "--masks", street.parent / "masks")
+    masks = street.parent / "masks"
+    code, out = study(street, "--keypoints", f"own={path}", "--masks", masks, "--frames", 4)
     assert code == 0
-    planned = Study(
-        street,
-        ("00", "01"),
-        sources.named([("keypoints", "own", path), ("masks", None, street.parent / "masks")], None),
-        (),
-    )
+    both = sources.named([("keypoints", "own", path), ("masks", None, masks)], None)
+    planned = Study(street, ("00", "01"), both, (), frames=4)
     runs = pd.read_csv(out / "runs.csv", dtype={"sequence": str}, keep_default_na=False)
     figure = report.figure_sources(planned, runs)
     own, masked = np.reshape(figure.axes, (2, 3))
-    expected = cv2.goodFeaturesToTrack(Street(12).frame(6), 300, 0.01, 5)[:, 0]
+    expected = cv2.goodFeaturesToTrack(Street(3).frame(2), 300, 0.01, 5)[:, 0]
     assert np.array_equal(own[2].collections[0].get_offsets(), expected)
     assert not own[1].images and masked[1].images
     failed = runs[runs["source"] != "own"]
@@ -143,7 +141,7 @@ def test_own_keypoints_are_drawn(street, capsys):
 
 
 BREAKING = """
-from thesis_repro.odometry.odometry import detect as usual
+from thesis_repro.odometry.loop import detect as usual
 calls = []
 def detect(frame, settings, mask):
     calls.append(frame)
@@ -156,8 +154,9 @@ def detect(frame, settings, mask):
 def test_a_source_that_breaks_later_is_told_once_and_stays_in_the_summary(street, capsys):
     path = street.parent / "own.py"
     path.write_text(BREAKING)
-    masks = ["--masks", f"net={street.parent / 'masks'}", "--controls", "--sequences", "00"]
-    code, out = study(street, "--keypoints", f"own={path}", *masks, "--repetitions", 2)
+    masks = ["--masks", f"net={street.parent / 'masks'}", "--controls", "--frames", 6]
+    words = ["--keypoints", f"own={path}", "--sequences", "00", "--repetitions", 2]
+    code, out = study(street, *words, *masks)
     lines = capsys.readouterr().err.splitlines()
     (line,) = [line for line in lines if "broken" in line]
     assert code == 1 and ",," not in line and "\\n" not in line

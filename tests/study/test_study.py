@@ -3,7 +3,6 @@
 import re
 import shutil
 import signal
-import sys
 from dataclasses import replace
 
 import cv2
@@ -149,34 +148,10 @@ def test_a_killed_study_resumes_and_ends_as_an_undisturbed_one(
     done, study, small_world, small_labels, masks, tmp_path
 ):
     folder = tmp_path / "out"
-    command = [
-        sys.executable,
-        "-m",
-        "thesis_repro",
-        "study",
-        "--kitti",
-        small_world / "kitti",
-        "--labels",
-        f"net={small_labels}",
-        "--masks",
-        f"by-hand={masks}",
-        "--widths",
-        5,
-        7,
-        "--controls",
-        7,
-        "--repetitions",
-        2,
-        "--frames",
-        FRAMES,
-        "--estimator",
-        "thesis",
-        "--jobs",
-        2,
-        "--output",
-        folder,
-    ]
-    process = trials.start(command, trials.ROOT)
+    sources = ["--labels", f"net={small_labels}", "--masks", f"by-hand={masks}"]
+    sizes = ["--widths", 5, 7, "--controls", 7, "--repetitions", 2, "--frames", FRAMES]
+    words = ["study", "--kitti", small_world / "kitti", *sources, *sizes, "--estimator", "thesis"]
+    process = trials.start(trials.thesis(*words, "--jobs", 1, "--output", folder), trials.ROOT)
     trials.wait_for(lambda: process.poll() is not None or files(folder), 600)
     trials.kill(process)
     assert process.returncode == -signal.SIGKILL
@@ -206,7 +181,7 @@ def test_each_folder_of_label_maps_may_name_its_ids(small_world, small_labels, t
 @pytest.fixture
 def brought(study, done, tmp_path):
     """A study of own keypoints, which are all keypoints, and of the paths with all keypoints."""
-    (tmp_path / "mine.py").write_text("from thesis_repro.odometry.odometry import detect\n")
+    (tmp_path / "mine.py").write_text("from thesis_repro.odometry.loop import detect\n")
     (tmp_path / "slam").mkdir()
     for name, form in (("00", "kitti"), ("01", "tum")):
         written = done[0] / "paths" / form / name / "baseline-0.txt"

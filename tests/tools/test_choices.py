@@ -1,28 +1,22 @@
 """The table of all choices: streets as units, and one rule for everybody."""
 
-from itertools import product
-
+import made_up
 import pandas as pd
 
 import choices
+from thesis_repro.odometry.estimators import COMPARED
 from thesis_repro.study import jobs
 from thesis_repro.study.jobs import ESTIMATORS
 
 
 def test_one_standard_counts_streets_and_asks_rule_5_of_every_choice():
     streets = [f"{number:02d}" for number in range(8)]
-    rows = []
-    for street, estimator, method in product(
-        streets, ESTIMATORS, ("baseline", "masked", "inverse")
-    ):
-        for repetition in range(4):
-            row = {"sequence": street, "estimator": estimator, "method": method, "lost": 0}
-            row |= {"dilation_width": jobs.CONTROL_WIDTH, "mean_keypoints": 800, "failed": 0}
-            row |= {"se3": 1.0, "rotation": 0.1}
-            if method == "masked":  # half of the runs fail on one street, a quarter on another
-                row["lost"] = int(repetition < {"03": 2, "04": 1}.get(street, 0))
-            rows.append(row)
-    runs = pd.DataFrame(rows)
+    widths = {"baseline": [None], "masked": [jobs.CONTROL_WIDTH], "inverse": [jobs.CONTROL_WIDTH]}
+    runs = made_up.runs(streets, lambda *_: 1.0, widths, repetitions=4)
+    masked, repetition = runs["method"] == "masked", runs["repetition"]
+    # half of the runs fail on one street, a quarter on another
+    runs.loc[masked & (runs["sequence"] == "03") & (repetition < 2), "lost"] = 1
+    runs.loc[masked & (runs["sequence"] == "04") & (repetition < 1), "lost"] = 1
     few_runs = pd.DataFrame(columns=["sequence", "choice", "number", "estimator", "failed"])
     worths = pd.DataFrame(
         {
@@ -41,7 +35,8 @@ def test_one_standard_counts_streets_and_asks_rule_5_of_every_choice():
     table = choices.table(runs, few_runs, worths).set_index(["streets", "choice"])
     assert {streets for streets, _ in table.index} == {"all 8", "7, without 01"}
     masks, inverse = (table.loc["all 8", name] for name in ("masks", "all but the boundaries"))
-    for title in ESTIMATORS.values():
+    for estimator in COMPARED:
+        title = ESTIMATORS[estimator]
         failing = f"streets on which it fails, {title}"
         assert masks[failing].startswith("1 ") and inverse[failing].startswith("0 ")
     rule = "no worse (rule 5)"  # the errors are equal, so only the failures decide

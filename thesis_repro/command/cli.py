@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import redirect_stdout, suppress
 from dataclasses import replace
 from itertools import chain
+from math import isnan
 from pathlib import Path
 from typing import Any
 
@@ -115,7 +116,7 @@ def odometry(options: Any) -> None:
     if options.tum:
         write_tum(options.tum, result.poses, sequence.times)
     steps = len(sequence), result.failed_steps, result.dropped_steps
-    _warn(checks.of_run(sequence.name, *steps, settings.scale_gate))
+    _warn(checks.run_warnings(sequence.name, *steps, settings.scale_gate))
     if sequence.has_truth:
         reason = metrics.foreign_truth(result.poses, sequence.poses)
         _warn([f"{sequence.poses_path}: {reason}"] * bool(reason))
@@ -143,7 +144,7 @@ def odometry(options: Any) -> None:
 def study(options: Any) -> int:
     """Compare your own masks, keypoints or paths with all keypoints and with controls."""
     from thesis_repro import checks
-    from thesis_repro.data import kitti
+    from thesis_repro.data import kitti, layout
     from thesis_repro.running import provenance
     from thesis_repro.study import sources
     from thesis_repro.study.plan import Study
@@ -164,7 +165,7 @@ def study(options: Any) -> int:
     if has_labels:
         all_widths = ALL_WIDTHS if mask_settings.has_width else ()
         widths = widths.union(*options.widths or [all_widths])
-    names = dict.fromkeys(kitti.locate(options.kitti, name)[1].name for name in options.sequences)
+    names = dict.fromkeys(layout.locate(options.kitti, name)[1].name for name in options.sequences)
     planned = Study(
         options.kitti.absolute(),
         tuple(names or kitti.sequences(options.kitti)),
@@ -199,7 +200,7 @@ def study(options: Any) -> int:
         planned = replace(planned, sequences=tuple(outcome.table["sequence"].unique()))
         runs = outcome.table[outcome.table["method"] == "baseline"].drop_duplicates("sequence")
         of_runs = [
-            checks.of_run(run.sequence, run.frames, run.flagged) for run in runs.itertuples()
+            checks.run_warnings(run.sequence, run.frames, run.flagged) for run in runs.itertuples()
         ]
         warnings += outcome.warnings + _warn(chain(*of_runs))
         worths = None
@@ -241,21 +242,16 @@ def _record(result: Any, sequence: Any) -> dict[str, Any]:
     """
     from thesis_repro.odometry import metrics
 
-    errors: dict[str, float | None] = dict.fromkeys(ERRORS.values())
-    if sequence.has_truth:
-        for name, value in metrics.errors(result.poses, sequence.poses).items():
-            if value == value:  # not NaN
-                errors[ERRORS[name]] = value
-    mean_keypoints = 0.0
+    errors = metrics.errors(result.poses, sequence.poses) if sequence.has_truth else {}
+    known = {name: value for name, value in errors.items() if not isnan(value)}
     detected = result.frames["detected"].dropna()
-    if len(detected):  # no frame may have structure
-        mean_keypoints = float(detected.mean())
     seconds = result.frames.filter(like="_seconds").sum(axis=1)
     return {
         "sequence": sequence.name,
         "frames": len(sequence),
-        **errors,
-        "mean_keypoints": mean_keypoints,
+        **{name: known.get(error) for error, name in ERRORS.items()},
+        # no frame may have structure
+        "mean_keypoints": float(detected.mean()) if len(detected) else 0.0,
         "ms_per_frame": 1000 * float(seconds.mean()),
         "flagged": {flag: int(count) for flag, count in result.flagged.items()},
     }
@@ -298,11 +294,11 @@ def _check_masks(sequence: Any, mask_sets: Iterable) -> list[str]:
     """Print what masks of a sequence hold, and return warnings of doubtful input."""
     from thesis_repro import checks
 
-    warnings = checks.of_sequence(sequence)
+    warnings = checks.sequence_warnings(sequence)
     for masks in mask_sets:
         with suppress(InputError):  # a file that cannot be read is reported when it is used
             program.log.info(checks.describe_masks(masks, sequence))
-            warnings += checks.of_masks(masks)
+            warnings += checks.mask_warnings(masks)
     return warnings
 
 
@@ -320,20 +316,16 @@ def _image_folders(root: Path) -> Iterator[tuple[Path, list[Path]]]:
     The path is a folder of images, a sequence, a KITTI folder or a folder of sequences.
     Raises InputError if there are no images.
     """
-    from thesis_repro.data import kitti
+    from thesis_repro.data import layout
 
     folders = [root]
-    if root.is_dir() and not kitti.has_frames(root):
-        parent = kitti.folder_of(root)
+    if root.is_dir() and not layout.has_frames(root):
+        parent = layout.sequences_folder(root)
         if not parent.is_dir():
             parent = root
-        folders = kitti.folders_with_frames(parent) or [root]
+        folders = layout.folders_with_frames(parent) or [root]
     for folder in folders:
-        image_folder = kitti.images_of(folder)
-        paths = kitti.frames_in(image_folder)
-        if not paths:
-            raise InputError(f"{image_folder}: holds no PNG or JPEG images")
-        yield folder, paths
+        yield folder, layout.frames_in(layout.frame_folder(folder))
 
 
 def _mask_settings(options: Any, has_labels: bool = True) -> Any:

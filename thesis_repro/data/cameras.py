@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thesis_repro.data.trajectories import text_of
+from thesis_repro.data.trajectories import read_text
 from thesis_repro.errors import InputError
 
 # k3 may be left out, or all of the distortion
@@ -40,18 +40,16 @@ def read_camera(path: str | Path) -> Camera:
     EuRoC (sensor.yaml), Kalibr (its cam0) or ORB-SLAM have it. Raises InputError for any other
     file, and for a camera of another model, such as a fisheye.
     """
-    text, size = text_of(path), None
+    text = read_text(path)
+    is_yaml = Path(path).suffix in (".yaml", ".yml")
+    if is_yaml:
+        text = text.partition("cam1:")[0]
+        _check_model(path, text)
     try:
-        if Path(path).suffix in (".yaml", ".yml"):
-            text = text.partition("cam1:")[0]
-            _check_model(path, text)
-            numbers, size = _numbers_of_yaml(text), _size_of_yaml(text)
-        else:
-            numbers = np.array(text.split(), np.float64)
-    except ValueError as error:
-        if isinstance(error, InputError):
-            raise
-        numbers = np.empty(0)
+        numbers = _numbers_of_yaml(text) if is_yaml else np.array(text.split(), np.float64)
+        size = _size_of_yaml(text)
+    except ValueError:
+        numbers, size = np.empty(0), None
     if len(numbers) - 4 not in COUNTS:
         raise InputError(
             f"{path}: must hold {' '.join(NAMES[:-1])}, only the first four, or be YAML of OpenCV's "

@@ -1,58 +1,41 @@
 """KITTI odometry: frames, camera, times and ground truth of a sequence or a raw drive."""
 
-import re
-from collections import namedtuple
 from collections.abc import Iterator
 from copy import copy
-from decimal import Decimal
-from functools import cache, cached_property
-from itertools import pairwise
+from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 
 from thesis_repro.data import cameras, kitti_raw
+from thesis_repro.data.geometry import CAMERAS, check_camera, is_camera_matrix
+from thesis_repro.data.layout import (
+    IMAGE_FOLDERS,
+    folders_with_frames,
+    frame_folder,
+    frames_in,
+    locate,
+    say_once,
+    sequences_folder,
+)
 from thesis_repro.data.trajectories import (
     have_times,
+    read_line,
     read_poses,
     read_poses_at,
     read_times,
-    text_of,
 )
 from thesis_repro.errors import InputError
-from thesis_repro.running import program
-from thesis_repro.running.files import images, read_gray
+from thesis_repro.running.files import read_gray
 
-# Intrinsics in pixels at the stated image size (Section 3.7.2); KITTI's gray images have no
-# distortion.
-Camera = namedtuple("Camera", "width height fx fy cx cy")
-_CAMERA_00 = Camera(1241, 376, 718.856, 718.856, 607.1928, 185.2157)
-_CAMERA_03 = Camera(1242, 375, 721.5377, 721.5377, 609.5593, 172.854)
-_CAMERA_04 = Camera(1226, 370, 707.0912, 707.0912, 601.8873, 183.1104)
-CAMERAS = {
-    "00": _CAMERA_00,
-    "01": _CAMERA_00,
-    "02": _CAMERA_00,
-    "03": _CAMERA_03,
-    **{f"{n:02d}": _CAMERA_04 for n in range(4, 11)},
-}
-# width and height that go with a focal length and a centre's u, which tell KITTI's cameras apart
-KNOWN_SIZES = {
-    (round(camera.fx, 3), round(camera.cx, 3)): (camera.width, camera.height)
-    for camera in CAMERAS.values()
-}
-
-# left gray, left colour, then the right ones
-IMAGE_FOLDERS = ("image_0", "image_2", "image_1", "image_3")
 # names of cameras' lines in the calibration
 CALIBRATION_KEYS = {
     **{name: f"P{name[-1]}" for name in IMAGE_FOLDERS},
     **{name: f"P_rect_{name[-2:]}" for name in kitti_raw.IMAGE_FOLDERS},
 }
 TRUE_LABELS = "labels_0"  # exact label maps beside image_0, which only the embedded world has
-DECIMAL = re.compile(r"\d+\.\d+")  # names of frames that may be seconds
-MIN_FRAME_SIDE = 16  # pixels; keypoints cannot be tracked in smaller frames
 # Pixels near a border where keypoints are left out: half a window of the tracker, which would see
 # the border's edge
 BORDER_MARGIN = 10
@@ -73,7 +56,7 @@ def sequences(root: str | Path) -> list[str]:
             names.append(name)
     if not names:
         raise InputError(
-            f"{folder_of(root)}: no sequence holds frames (image_0 or image_2) and ground truth"
+            f"{sequences_folder(root)}: no sequence holds frames (image_0 or image_2) and ground truth"
         )
     return names
 
@@ -84,116 +67,11 @@ def with_frames(root: str | Path) -> list[str]:
     KITTI publishes no ground truth for 11 to 21. Raises InputError if the folder has another
     layout.
     """
-    if not folder_of(root).is_dir():
+    if not sequences_folder(root).is_dir():
         raise InputError(
             f"{root}: must be the folder that holds sequences/NN/image_0 and poses/NN.txt, or raw drives"
         )
-    return [folder.name for folder in folders_with_frames(folder_of(root))]
-
-
-def folders_with_frames(parent: Path) -> list[Path]:
-    """Folders of sequences in a folder, in sorted order."""
-    return sorted(folder for folder in parent.iterdir() if folder.is_dir() and has_frames(folder))
-
-
-def has_frames(folder: Path) -> bool:
-    """Whether a folder is that of a sequence, or holds images itself."""
-    return images_of(folder) != folder or bool(images(folder))
-
-
-def folder_of(root: str | Path) -> Path:
-    """Folder of a root's sequences.
-
-    It is the root itself if it holds raw drives, else root/sequences, which may hold raw drives as
-    well.
-    """
-    root = Path(root)
-    folder = root / "sequences"
-    if not folder.is_dir() and any(map(kitti_raw.is_drive, root.glob("*"))):
-        return root
-    return folder
-
-
-def images_of(folder: str | Path, camera: str | None = None) -> Path:
-    """Folder of a sequence's frames.
-
-    The default is the left camera's, gray or else colour. If neither exists, it is the sequence's
-    folder itself. Raises InputError if the camera is unknown, or if the folder is missing.
-    """
-    folder = Path(folder)
-    cameras, inner = IMAGE_FOLDERS, ""
-    if kitti_raw.is_drive(folder):
-        cameras, inner = kitti_raw.IMAGE_FOLDERS, kitti_raw.FRAMES
-    names: tuple[str, ...] = cameras[:2]
-    if camera is not None:
-        names = (camera,)
-        if camera not in cameras:
-            known = ", ".join(sorted(cameras))
-            raise InputError(f"camera {camera!r}: unknown; choose one of {known}")
-    for name in names:
-        if (folder / name / inner).is_dir():
-            return folder / name / inner
-    if folder.is_file():
-        raise InputError(
-            f"{folder}: is a file; a sequence is a folder of frames (docs/own-masks.md says how to write "
-            "those of a video)"
-        )
-    if camera is not None or not folder.is_dir():
-        raise InputError(f"{folder / (camera or '')}: no such folder; it must hold the frames")
-    return folder
-
-
-def frames_in(folder: Path) -> list[Path]:
-    """Images of a folder in the order of their numbers.
-
-    Names such as 0.15 and 0.2, which differ in their number of decimals, are decimal numbers, or
-    seconds and nanoseconds without leading zeros. Raises InputError if they may be both, in
-    different orders.
-    """
-    paths = images(folder)
-    parts = [path.stem.split(".") for path in paths if DECIMAL.fullmatch(path.stem)]
-    fractions = [fraction for _, fraction in parts]
-    if len(parts) < len(paths) or len(set(map(len, fractions))) < 2:
-        return paths
-    by_value = sorted(paths, key=lambda path: Decimal(path.stem))
-    by_nanoseconds = sorted(paths, key=lambda path: _nanoseconds(path.stem))
-    form, ordered = "decimal numbers", by_value
-    if _may_be_nanoseconds(by_nanoseconds, fractions):
-        # decimals without their last zeros do not end with a zero
-        if any(len(fraction) > 1 and fraction.endswith("0") for fraction in fractions):
-            form, ordered = "seconds and nanoseconds", by_nanoseconds
-        elif by_value != by_nanoseconds:
-            raise InputError(
-                f"{folder}: {paths[0].name} and the like may be decimal numbers, or seconds and nanoseconds, "
-                "in different orders; rename the frames so that all have as many digits after the dot"
-            )
-    _say_once(
-        f"{folder}: frames are in the order of their names as {form}, {ordered[0].stem} to "
-        f"{ordered[-1].stem}"
-    )
-    return ordered
-
-
-def _nanoseconds(stem: str) -> int:
-    seconds, fraction = stem.split(".")
-    return int(seconds) * 10**9 + int(fraction)
-
-
-def _may_be_nanoseconds(ordered: list[Path], fractions: list[str]) -> bool:
-    """Whether names may be seconds and nanoseconds without leading zeros.
-
-    ordered: the frames in the order of these times, of which no camera makes more than 100,000 a
-    second.
-    """
-    times = [_nanoseconds(path.stem) for path in ordered]
-    is_slow = all(later - time >= 10_000 for time, later in pairwise(times))
-    has_no_zeros = not any(len(text) > 1 and text.startswith("0") for text in fractions)
-    return is_slow and has_no_zeros and max(map(len, fractions)) <= 9
-
-
-@cache
-def _say_once(line: str) -> None:
-    program.log.info(line)
+    return [folder.name for folder in folders_with_frames(sequences_folder(root))]
 
 
 class Sequence:
@@ -224,7 +102,7 @@ class Sequence:
         For a sequence outside of KITTI, root is None and name is a folder. The folder is a raw
         drive, or holds calib.txt, the frames (in image_0 or in the folder itself) and optionally
         times.txt and poses.txt.
-        camera: one of IMAGE_FOLDERS, see `images_of`. speed: metres a second, for a sequence
+        camera: one of IMAGE_FOLDERS, see `frame_folder`. speed: metres a second, for a sequence
         without ground truth; the default is one metre a frame. fps: frames a second, for a
         sequence without times.txt. truth: file of the ground truth, in any form that poses.txt may
         have. calibration: file of a camera, see `cameras.read_camera`; its distortion is taken out
@@ -235,23 +113,21 @@ class Sequence:
             self.poses_path = Path(truth)
         self.name, self.speed = self.folder.name, speed
         self.border: np.ndarray | None = None  # see `without_border`
-        frame_folder = images_of(self.folder, camera)
-        self.frame_paths = frames_in(frame_folder)
-        if not self.frame_paths:
-            raise InputError(f"{frame_folder}: holds no PNG or JPEG frames")
-        camera_folder, self.calibration_path = frame_folder, self.folder / "calib.txt"
+        image_folder = frame_folder(self.folder, camera)
+        self.frame_paths = frames_in(image_folder)
+        camera_folder, self.calibration_path = image_folder, self.folder / "calib.txt"
         self.times_path = self.folder / "times.txt"
         if kitti_raw.is_drive(self.folder):
-            camera_folder = frame_folder.parent
+            camera_folder = image_folder.parent
             self.calibration_path = kitti_raw.calibration(self.folder)
             self.times_path = camera_folder / kitti_raw.TIMES
-        self.distortion, self.stated_size = np.empty(0), None
         if calibration is not None:
             self.calibration_path = Path(calibration)
-            camera_of_file = cameras.read_camera(calibration)
-            self.intrinsics, self.distortion, self.stated_size = camera_of_file
+            matrix, distortion, stated_size = cameras.read_camera(calibration)
         else:
-            self.intrinsics = read_intrinsics(self.calibration_path, camera_folder.name)
+            matrix = read_intrinsics(self.calibration_path, camera_folder.name)
+            distortion, stated_size = np.empty(0), None
+        self.intrinsics, self.distortion, self.stated_size = matrix, distortion, stated_size
         self.has_times = self.times_path.exists()
         self.times = self._read_times(self.times_path, fps)
         self.has_truth = truth is not None or self.poses_path.exists()
@@ -269,7 +145,7 @@ class Sequence:
             check_count(path, len(times), self.frame_paths)
             return times
         if fps is None:
-            _say_once(
+            say_once(
                 f"{path}: no such file, so {1 / FRAME_TIME:g} frames a second are assumed (--fps gives "
                 "another number)"
             )
@@ -291,7 +167,7 @@ class Sequence:
         if len(gaps):
             raise InputError(f"{path}: {self.frame_paths[gaps[0]].name} has no pose within 0.01 s")
         if len(indices) < len(self):
-            _say_once(f"{path}: has poses of {len(indices)} of {len(self)} frames, which are used")
+            say_once(f"{path}: has poses of {len(indices)} of {len(self)} frames, which are used")
         self.frame_paths = self.frame_paths[first:end]
         self.times = self.times[first:end]
 
@@ -319,17 +195,6 @@ class Sequence:
         return self._poses
 
     @property
-    def assumed_steps(self) -> np.ndarray:
-        """Step lengths without ground truth, (n,), metres: from the speed, or 1.
-
-        The first one is 0.
-        """
-        steps = np.ones(len(self) - 1)
-        if self.speed is not None:
-            steps = self.speed * np.diff(self.times)
-        return np.concatenate([[0.0], steps])
-
-    @property
     def files(self) -> list[Path]:
         """All files of the sequence.
 
@@ -352,8 +217,8 @@ class Sequence:
     @cached_property
     def size(self) -> tuple[int, int]:
         """Size (height, width) of the first frame. Raises InputError as `check_camera` does."""
-        size = self._read(self.frame_paths[0]).shape
         first = self.frame_paths[0]
+        size = read_gray(first, np.uint16).shape
         check_camera(self.calibration_path, self.intrinsics, first, size, self.stated_size)
         return size
 
@@ -362,14 +227,13 @@ class Sequence:
 
         Raises InputError if it is unreadable or has another size.
         """
-        image = self._read(self.frame_paths[index])
-        check_size(self.frame_paths[index], image.shape, self.size)
+        path = self.frame_paths[index]
+        if self._white:
+            image = cv2.convertScaleAbs(read_gray(path, np.uint16), alpha=255 / self._white)
+        else:
+            image = read_gray(path)
+        check_size(path, image.shape, self.size)
         return self.undistorted(image)
-
-    def _read(self, path: Path) -> np.ndarray:
-        if not self._white:
-            return read_gray(path)
-        return cv2.convertScaleAbs(read_gray(path, np.uint16), alpha=255 / self._white)
 
     @cached_property
     def _white(self) -> int:
@@ -377,7 +241,7 @@ class Sequence:
         first = read_gray(self.frame_paths[0], np.uint16)
         if first.dtype == np.uint8:
             return 0
-        _say_once(
+        say_once(
             f"{self.folder}: frames have 16 bits; {first.max()}, the first one's maximum, is white"
         )
         return int(first.max())
@@ -399,9 +263,8 @@ class Sequence:
         )
 
     def frames(self) -> Iterator[np.ndarray]:
-        """Yield the frames in order."""
-        for index in range(len(self)):
-            yield self.frame(index)
+        """Return the frames in order."""
+        return map(self.frame, range(len(self)))
 
     def visible(self, index: int) -> np.ndarray | None:
         """Where keypoints may lie in frame `index`, (height, width) uint8: 255, elsewhere 0.
@@ -449,26 +312,18 @@ class Sequence:
         return short
 
 
-def locate(root: str | Path | None, name: str | Path) -> tuple[Path, Path, Path]:
-    """Root, folder and poses of a sequence.
+def scales(sequence: Sequence) -> np.ndarray:
+    """Distances between the true positions of consecutive frames, (n,), metres. The first one is 0.
 
-    The poses are root/poses/NN.txt or else poses.txt in the sequence's folder, or the OXTS's folder
-    of a raw drive. The arguments are those of Sequence.
+    Without ground truth, they follow from the speed, or are 1.
     """
-    folder = Path(name).resolve()
-    poses = folder / "poses.txt"
-    if root is None and folder.parent.name == "sequences":
-        root, name = folder.parent.parent, folder.name  # the folder belongs to a KITTI root
-    if root is not None:
-        root, name = Path(root), str(name)
-        if name.isdigit() and not (folder_of(root) / name).is_dir():
-            name = name.zfill(2)
-        folder, poses = folder_of(root) / name, root / "poses" / f"{name}.txt"
-    if kitti_raw.is_drive(folder):
-        poses = folder / kitti_raw.OXTS
-    elif not poses.exists() and (folder / "poses.txt").exists():
-        poses = folder / "poses.txt"
-    return root or folder.parent, folder, poses
+    if sequence.has_truth:
+        steps: Any = [np.linalg.norm(step) for step in np.diff(sequence.poses[:, :3, 3], axis=0)]
+    elif sequence.speed is not None:
+        steps = sequence.speed * np.diff(sequence.times)
+    else:
+        steps = np.ones(len(sequence) - 1)
+    return np.array([0.0, *steps])
 
 
 def check_count(path: Path, count: int, frame_paths: list[Path]) -> None:
@@ -500,56 +355,9 @@ def read_intrinsics(path: str | Path, camera: str = "image_0") -> np.ndarray:
     camera, of P_rect_00 to P_rect_03. Raises InputError if the line is missing, or if the camera
     has distortion or skew.
     """
-    key = CALIBRATION_KEYS.get(camera, "P0")
-    form = f"must hold a line '{key}: f 0 u 0 0 f v 0 0 0 1 0' of a camera without distortion"
-    try:
-        lines = [line for line in text_of(path).splitlines() if line.startswith(f"{key}:")]
-        matrix = np.array(lines[0].split()[1:], np.float64).reshape(3, 4)[:, :3]
-    except InputError as error:
-        raise InputError(f"{error}; it {form}") from None
-    except (ValueError, IndexError):
-        matrix = np.zeros((3, 3))
+    form = ", f 0 u 0 0 f v 0 0 0 1 0, of a camera without distortion"
+    key = f"{CALIBRATION_KEYS.get(camera, 'P0')}:"
+    matrix = read_line(path, key, 12, form).reshape(3, 4)[:, :3]
     if not is_camera_matrix(matrix):
-        raise InputError(f"{path}: {form}")
+        raise InputError(f"{path}: line '{key}' must hold 12 numbers{form}")
     return matrix
-
-
-def is_camera_matrix(matrix: np.ndarray) -> bool:
-    """Whether a matrix is that of Equation 2.4, (3, 3), without skew."""
-    if matrix.shape != (3, 3) or not np.isfinite(matrix).all():
-        return False
-    (fx, _, u), (_, fy, v), _ = matrix
-    return min(fx, fy) > 0 and np.array_equal(matrix, [[fx, 0, u], [0, fy, v], [0, 0, 1]])
-
-
-def check_camera(
-    path: Path | str,
-    intrinsics: np.ndarray,
-    frame: Path | str,
-    size: tuple[int, int],
-    stated: tuple[int, int] | None = None,
-) -> None:
-    """Raise InputError if frames are too small or do not fit the camera.
-
-    size: height and width. stated: those that the camera's file says its frames have.
-    """
-    height, width = size
-    if min(size) < MIN_FRAME_SIDE:
-        raise InputError(
-            f"{frame}: {width}x{height} pixels; each side needs {MIN_FRAME_SIDE} or more"
-        )
-    (fx, _, u), (_, fy, v), _ = intrinsics
-    if stated is None:
-        stated = KNOWN_SIZES.get((round(fx, 3), round(u, 3)), (width, height))[::-1]
-    if stated != size:
-        raise InputError(
-            f"{path}: is for frames of {stated[1]}x{stated[0]} pixels, but {frame} has "
-            f"{width}x{height}; scale or shift focal lengths and centre as the frames were"
-        )
-    center_fits = 0 <= u <= width and 0 <= v <= height
-    focal_lengths_fit = all(width / 100 < focal < width * 100 for focal in (fx, fy))
-    if not (center_fits and focal_lengths_fit):
-        raise InputError(
-            f"{path}: focal lengths {fx:g}, {fy:g} and centre {u:g}, {v:g} do not fit frames of "
-            f"{width}x{height} pixels"
-        )

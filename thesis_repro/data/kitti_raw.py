@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from thesis_repro.data.trajectories import text_of
+from thesis_repro.data.trajectories import read_line, read_text
 from thesis_repro.errors import InputError
 from thesis_repro.running.files import listed
 
@@ -48,7 +48,7 @@ def read_times(path: str | Path) -> np.ndarray:
 
     Raises InputError unless they increase.
     """
-    lines = text_of(path).strip().splitlines()
+    lines = read_text(path).strip().splitlines()
     try:
         stamps = np.array(lines, "datetime64[ns]")
     except ValueError as error:
@@ -70,7 +70,7 @@ def read_poses(folder: str | Path) -> np.ndarray:
     scanner_to_camera = _rigid_motion(calibration(folder, "velo_to_cam"), "R", "T")
     rectify = _rigid_motion(calibration(folder, "cam_to_cam"), "R_rect_00")
     to_camera = rectify @ (scanner_to_camera @ to_scanner)
-    measured = np.array([_numbers(path, "", 30)[:6] for path in _measurements(folder)])
+    measured = np.array([read_line(path, "", 30)[:6] for path in _measurements(folder)])
     if not len(measured):
         raise InputError(f"{Path(folder) / OXTS}: holds no measurements, one file a frame")
     poses = _imu_poses(measured)
@@ -80,9 +80,9 @@ def read_poses(folder: str | Path) -> np.ndarray:
 def _rigid_motion(path: Path, rotation: str, translation: str | None = None) -> np.ndarray:
     """Return the 4x4 matrix of two lines of a calibration file; without the second, no shift."""
     motion = np.eye(4)
-    motion[:3, :3] = _numbers(path, f"{rotation}:", 9).reshape(3, 3)
+    motion[:3, :3] = read_line(path, f"{rotation}:", 9).reshape(3, 3)
     if translation is not None:
-        motion[:3, 3] = _numbers(path, f"{translation}:", 3)
+        motion[:3, 3] = read_line(path, f"{translation}:", 3)
     return motion
 
 
@@ -104,15 +104,3 @@ def _imu_poses(measured: np.ndarray) -> np.ndarray:
     # yaw, then pitch, then roll, each about the axes that the earlier ones have turned
     poses[:, :3, :3] = Rotation.from_euler("ZYX", measured[:, :2:-1]).as_matrix()
     return poses
-
-
-def _numbers(path: Path, prefix: str, count: int) -> np.ndarray:
-    """Return the `count` numbers of a file's first line that begins with a prefix."""
-    lines = [line for line in text_of(path).splitlines() if line.startswith(prefix)]
-    try:
-        numbers = np.array(lines[0].removeprefix(prefix).split(), np.float64)
-    except (ValueError, IndexError):
-        numbers = np.empty(0)
-    if len(numbers) != count or not np.isfinite(numbers).all():
-        raise InputError(f"{path}: must hold a line '{prefix}' of {count} finite numbers")
-    return numbers

@@ -7,16 +7,26 @@ Cityscapes' train ids ("train") and colours ("colors").
 
 import csv
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from thesis_repro.data.cityscapes import ID, LABELS, TRAINED, read_label_map
-from thesis_repro.data.trajectories import text_of
+from thesis_repro.data.trajectories import read_text
 from thesis_repro.errors import InputError
 from thesis_repro.running.files import read_color, read_ids
 from thesis_repro.running.provenance import digest_of_file
 
 LABEL_IDS, TRAIN_IDS, COLORS = "labels", "train", "colors"
+# {name: see `read_table`}; of labels with one colour, the first one is meant: "car" before "license
+# plate"
+TABLES: dict[Any, tuple[bool, dict[int, int]]] = {
+    TRAIN_IDS: (
+        False,
+        {255: ID["unlabeled"]} | {number: ID[name] for number, name in enumerate(TRAINED)},
+    ),
+    COLORS: (True, {int.from_bytes(label.color): label.id for label in reversed(LABELS)}),
+}
 NOT_NAMED = 255  # no label id
 RGB = np.array([1 << 16, 1 << 8, 1])  # makes one number of a colour
 
@@ -26,13 +36,9 @@ def read_table(path: str | Path) -> tuple[bool, dict[int, int]]:
 
     Raises InputError, naming the line, for a line that is not an id or a colour and a label.
     """
-    if path == TRAIN_IDS:
-        table = {number: ID[name] for number, name in enumerate(TRAINED)}
-        return False, table | {255: ID["unlabeled"]}
-    if path == COLORS:
-        # of labels with one colour, the first one is meant: "car" before "license plate"
-        return True, {int.from_bytes(label.color): label.id for label in reversed(LABELS)}
-    lines = text_of(path).split("\n")
+    if path in TABLES:
+        return TABLES[path]
+    lines = read_text(path).split("\n")
     table = {}
     for number, row in enumerate(csv.reader(lines), 1):
         if not row or row[0] in ("id", "color"):
@@ -51,7 +57,7 @@ def read_table(path: str | Path) -> tuple[bool, dict[int, int]]:
 
 def record(ids: str | Path) -> dict[str, str]:
     """Return what the record of results has of a table in a file: its digest."""
-    if ids in (LABEL_IDS, TRAIN_IDS, COLORS):
+    if ids in (LABEL_IDS, *TABLES):
         return {}
     return {"table": digest_of_file(ids)}
 

@@ -5,13 +5,12 @@ from pathlib import Path
 
 import numpy as np
 
+from thesis_repro.data.geometry import are_poses
 from thesis_repro.errors import InputError
 from thesis_repro.running.files import write_text
 
-ROTATION_TOLERANCE = 1e-3  # largest entry of R R^T - I; pose files have few digits
 
-
-def text_of(path: str | Path) -> str:
+def read_text(path: str | Path) -> str:
     """Text of a file. Raises InputError if it cannot be read, or is not UTF-8."""
     try:
         # some editors begin a file with a byte order mark
@@ -21,6 +20,24 @@ def text_of(path: str | Path) -> str:
         raise InputError(f"{path}: cannot be read: {reason}") from None
 
 
+def read_line(path: str | Path, key: str, count: int, form: str = "") -> np.ndarray:
+    """Numbers, (count,), of a file's first line that begins with a key, such as "P0:".
+
+    form: what is said of them beside. Raises InputError unless they are `count` finite numbers.
+    """
+    wanted = f"must hold a line '{key}' of {count} finite numbers{form}"
+    try:
+        lines = [line for line in read_text(path).splitlines() if line.startswith(key)]
+        numbers = np.array(lines[0].removeprefix(key).split(), np.float64)
+    except InputError as error:
+        raise InputError(f"{error}; it {wanted}") from None
+    except (ValueError, IndexError):
+        numbers = np.empty(0)
+    if len(numbers) != count or not np.isfinite(numbers).all():
+        raise InputError(f"{path}: {wanted}")
+    return numbers
+
+
 def _read_numbers(path: str | Path, *columns: int) -> tuple[np.ndarray, list[int]]:
     """Return the numbers of a file, (n, columns), and the number of the line of each row.
 
@@ -28,7 +45,7 @@ def _read_numbers(path: str | Path, *columns: int) -> tuple[np.ndarray, list[int
     """
     form = f"must hold {columns[0]} finite numbers a line, one line a frame"
     rows, line_numbers = [], []
-    for number, line in enumerate(text_of(path).split("\n"), 1):
+    for number, line in enumerate(read_text(path).split("\n"), 1):
         if not line.strip():
             continue
         try:
@@ -83,7 +100,7 @@ def read_poses(path: str | Path) -> np.ndarray:
 
 def have_times(path: Path) -> bool:
     """Whether the poses of a file have times: in EuRoC's format (.csv), or in TUM's."""
-    lines = [line for line in text_of(path).splitlines() if line.strip() and line[0] != "#"]
+    lines = [line for line in read_text(path).splitlines() if line.strip() and line[0] != "#"]
     return path.suffix == ".csv" or bool(lines and len(lines[0].split()) == 8)
 
 
@@ -101,7 +118,7 @@ def read_poses_at(path: Path, times: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
     nowhere = np.zeros((len(times), 3)), np.tile([1.0, 0, 0, 0], (len(times), 1))
     frames = PoseTrajectory3D(*nowhere, times, name=f"the times of the frames of {path.parent}")
-    lines = [" ".join(line.split()) for line in text_of(path).splitlines()]
+    lines = [" ".join(line.split()) for line in read_text(path).splitlines()]
     file = io.StringIO("\n".join(filter(None, lines)))
     read = file_interface.read_tum_trajectory_file
     if path.suffix == ".csv":
@@ -115,20 +132,6 @@ def read_poses_at(path: Path, times: np.ndarray) -> tuple[np.ndarray, np.ndarray
         raise InputError(f"{path}: must hold finite positions and unit quaternions")
     indices, first = np.unique(np.searchsorted(times, frames.timestamps), return_index=True)
     return indices, poses[first]
-
-
-def are_poses(poses: np.ndarray) -> np.ndarray:
-    """Whether each of (n, 4, 4) is a right-handed rotation and a position in metres.
-
-    Returns (n,) booleans.
-    """
-    rotations = poses[:, :3, :3]
-    with np.errstate(over="ignore", invalid="ignore"):
-        products = rotations @ rotations.transpose(0, 2, 1)
-        errors = np.abs(products - np.eye(3)).max(axis=(1, 2))
-        is_right_handed = np.linalg.det(rotations) > 0
-    is_pose = (poses[:, 3] == [0, 0, 0, 1]).all(axis=1)
-    return is_pose & (errors <= ROTATION_TOLERANCE) & is_right_handed
 
 
 def write_kitti_poses(path: str | Path, poses: np.ndarray) -> None:

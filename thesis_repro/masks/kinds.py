@@ -140,7 +140,8 @@ def keypoint_mask(
     Raises InputError unless the label map is (h, w) label ids.
     """
     label_map = _checked(label_map)
-    check(dilation_width, size, settings)
+    if settings.has_width:
+        check_width(dilation_width, size)
     if settings == replace(THESIS_MASKS, ids=settings.ids):
         assert dilation_width is not None  # checked above
         return thesis_mask(label_map, size, dilation_width)
@@ -148,16 +149,10 @@ def keypoint_mask(
     if settings.movable is not None:
         mask[near_movable(label_map, size, settings.movable)] = 0
     if settings.margin:
-        inside = mask[settings.margin : -settings.margin, settings.margin : -settings.margin].copy()
-        mask[:] = 0
-        mask[settings.margin : -settings.margin, settings.margin : -settings.margin] = inside
+        first, last = slice(settings.margin), slice(-settings.margin, None)
+        mask[first] = mask[last] = 0
+        mask[:, first] = mask[:, last] = 0
     return mask
-
-
-def check(dilation_width: int | None, size: tuple[int, int], settings: MaskSettings) -> None:
-    """Raise InputError if a kind of mask needs another dilation width."""
-    if settings.has_width:
-        check_width(dilation_width, size)
 
 
 @remembered

@@ -16,18 +16,17 @@ def remembered(function: Callable) -> Callable:
     """
 
     @lru_cache(maxsize=8)
-    def of_bytes(ids: bytes, shape: tuple[int, ...], *arguments: Any) -> Any:
+    def from_bytes(ids: bytes, shape: tuple[int, ...], *arguments: Any) -> Any:
         result = function(np.frombuffer(ids, np.uint8).reshape(shape), *arguments)
-        if result is not None:
-            result.setflags(write=False)
+        result.setflags(write=False)
         return result
 
     @wraps(function)
-    def of_map(label_map: np.ndarray, *arguments: Any) -> Any:
-        return of_bytes(label_map.tobytes(), label_map.shape, *arguments)
+    def from_map(label_map: np.ndarray, *arguments: Any) -> Any:
+        return from_bytes(label_map.tobytes(), label_map.shape, *arguments)
 
-    _caches.append(of_bytes)
-    return of_map
+    _caches.append(from_bytes)
+    return from_map
 
 
 def forget() -> None:

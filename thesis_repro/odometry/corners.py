@@ -26,7 +26,7 @@ _latest: tuple[np.ndarray | None, dict[int, Corners]] = None, {}  # frame, corne
 def detect(
     frame: np.ndarray, settings: OdometrySettings = THESIS, mask: np.ndarray | None = None
 ) -> np.ndarray:
-    """Like `odometry.detect`. The corners of the latest frame that nobody can change are kept."""
+    """Like `loop.detect`. The corners of the latest frame that nobody can change are kept."""
     global _latest
     latest = _latest  # another thread may change it
     if latest[0] is not frame:

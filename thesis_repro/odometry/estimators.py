@@ -1,7 +1,7 @@
 """The names of estimators and detectors, in tables and on the command line.
 
 Settings take the objects: OdometrySettings(estimator=refined). A new estimator is a class with a
-method `motion` and, if it wants no RANSAC, its own `search` (types.Estimator), and an entry here.
+method `motion` and, if it wants no RANSAC, its own `search` (step.Estimator), and an entry here.
 """
 
 from collections.abc import Callable
@@ -10,21 +10,19 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from thesis_repro.odometry import keypoints
-from thesis_repro.odometry.types import Estimator, Matches, Motion, motion_of_vote
+from thesis_repro.odometry.loop import VoteOfAll
+from thesis_repro.odometry.step import Estimator, Matches, Motion
 
 
-class VoteOfInliers(NamedTuple):
+class VoteOfInliers(VoteOfAll):
     """The motion that most inliers vote for."""
 
-    calls: Any
-
     def motion(self, essential: np.ndarray, matches: Matches, scale: float, moves: bool) -> Motion:
-        """Return the motion of a step (see types.Estimator)."""
-        inliers = matches.inliers
-        voted = self.calls.recover_pose(
-            essential, matches.current[inliers], matches.previous[inliers]
+        """Return the motion of a step (see step.Estimator)."""
+        current, previous = matches.current[matches.inliers], matches.previous[matches.inliers]
+        return super().motion(
+            essential, Matches(current, previous, matches.threshold), scale, moves
         )
-        return motion_of_vote(*voted)
 
 
 def refined(calls: Any) -> Estimator:
@@ -39,12 +37,12 @@ class Entry(NamedTuple):
 
     title: str  # in tables and figures
     make: Callable | None  # as in settings: from the odometry's calls to an estimator
-    is_compared: bool = True  # in studies; otherwise only the ablations run it
 
 
 ESTIMATORS = {
     "thesis": Entry("thesis's estimator", None),
-    "inliers": Entry("vote of the inliers", VoteOfInliers, is_compared=False),
+    "inliers": Entry("vote of the inliers", VoteOfInliers),
     "refined": Entry("refined estimator", refined),
 }
+COMPARED = ("thesis", "refined")  # those of every study that names no others
 DETECTORS: dict[str, Callable | None] = {"shi-tomasi": None, "orb": keypoints.orb}

@@ -2,7 +2,9 @@
 
 A detector is a function of a frame (height, width), settings and a mask, (height, width) or None,
 which allows keypoints where it is not 0. It returns (N, 2) float32 pixels, strongest first. Those
-with a number are small objects, equal if their numbers are.
+with a number are small objects, equal if their numbers are. They are quicker on a frame that nobody
+can change (`corners.detect`). corners is imported where it is used, because it loads the compiler,
+which most runs do without.
 """
 
 from collections.abc import Callable
@@ -12,8 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from thesis_repro.errors import InputError
-from thesis_repro.odometry.settings import THESIS, OdometrySettings
+from thesis_repro.odometry.settings import THESIS, OdometrySettings, check_number
 
 FIELDS = (5, 16)  # rows and columns into which a frame is divided to fill a mask
 
@@ -37,7 +38,7 @@ class spread:  # it is called like a function
     number: int
 
     def __post_init__(self) -> None:
-        _check_number(self.number)
+        check_number("number of keypoints", self.number, int)
 
     def __call__(
         self,
@@ -46,8 +47,8 @@ class spread:  # it is called like a function
         mask: np.ndarray | None = None,
     ) -> np.ndarray:
         """Find the keypoints of a frame."""
-        corners = _corners()
-        frame = _unchanging(frame)
+        from thesis_repro.odometry import corners
+
         near, far = settings.min_distance, max(frame.shape)
         settings = replace(settings, max_keypoints=self.number)
         chosen = corners.detect(frame, settings, mask)
@@ -74,7 +75,7 @@ class filled:
     detector: Callable | None = None
 
     def __post_init__(self) -> None:
-        _check_number(self.number)
+        check_number("number of keypoints", self.number, int)
 
     def __call__(
         self,
@@ -83,8 +84,8 @@ class filled:
         mask: np.ndarray | None = None,
     ) -> np.ndarray:
         """Find the keypoints of a frame."""
-        corners = _corners()
-        frame = _unchanging(frame)
+        from thesis_repro.odometry import corners
+
         points = (self.detector or corners.detect)(frame, settings, mask)
         if mask is None:
             return points
@@ -108,7 +109,9 @@ def filtered(
     frame: np.ndarray, settings: OdometrySettings = THESIS, mask: np.ndarray | None = None
 ) -> np.ndarray:
     """Find the thesis's keypoints in the whole frame, and drop those outside the mask."""
-    points = _corners().detect(frame, settings)
+    from thesis_repro.odometry import corners
+
+    points = corners.detect(frame, settings)
     if mask is None:
         return points
     columns, rows = np.rint(points).astype(int).T
@@ -119,19 +122,6 @@ def _corners() -> Any:
     from thesis_repro.odometry import corners  # loads the compiler, which most runs do without
 
     return corners
-
-
-def _check_number(number: int) -> None:
-    if not isinstance(number, int | np.integer) or number < 1:
-        raise InputError(f"number of keypoints: {number!r} is not a whole number of 1 or more")
-
-
-def _unchanging(frame: np.ndarray) -> np.ndarray:
-    """A copy that nobody can change, unless the frame is one, see `corners.detect`."""
-    if frame.flags.writeable:
-        frame = frame.copy()
-        frame.setflags(write=False)
-    return frame
 
 
 def _fields(points: np.ndarray, size: tuple[int, ...]) -> np.ndarray:

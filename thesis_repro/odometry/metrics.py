@@ -10,7 +10,7 @@ from evo.main_ape import ape
 from scipy.spatial.transform import Rotation
 
 from thesis_repro.errors import InputError
-from thesis_repro.odometry.odometry import MAX_TURN
+from thesis_repro.odometry.loop import MAX_TURN
 
 
 def rmse(estimated: np.ndarray, true: np.ndarray) -> float:
@@ -69,7 +69,8 @@ def ate(estimated: np.ndarray, true: np.ndarray, alignment: str = "none") -> flo
     """
     if alignment not in ALIGNMENTS:
         raise InputError(f"alignment={alignment!r}: unknown; choose one of {', '.join(ALIGNMENTS)}")
-    reference, estimate = _evo_paths(estimated, true)
+    paths = _as_paths(estimated, true)
+    estimate, reference = (PosePath3D(poses_se3=list(poses.astype(float))) for poses in paths)
     if alignment != "none":
         try:
             estimate.align(reference, correct_scale=alignment == "sim3")
@@ -78,26 +79,16 @@ def ate(estimated: np.ndarray, true: np.ndarray, alignment: str = "none") -> flo
     return float(ape(reference, estimate, PoseRelation.translation_part).stats["rmse"])
 
 
-def _evo_paths(estimated: np.ndarray, true: np.ndarray) -> tuple[PosePath3D, PosePath3D]:
-    """The true and the estimated path, in evo's order."""
-    _as_paths(estimated, true)
-    return _evo_path(true), _evo_path(estimated)
-
-
-def _evo_path(poses: np.ndarray) -> PosePath3D:
-    return PosePath3D(poses_se3=list(np.array(poses, np.float64)))
-
-
 RELATIVE_LENGTH = 20.0  # metres; even the short excerpts have several segments of this length
 
 
 def relative_errors(
     estimated: np.ndarray, true: np.ndarray, length: float = RELATIVE_LENGTH
-) -> dict[str, Any]:
+) -> dict[str, float]:
     """Mean errors over segments of one length.
 
-    Returns {translation_percent, rotation_deg_per_100m, segments}. These are not the errors of the
-    KITTI benchmark (`kitti_errors`). A segment goes from each frame to the first frame that
+    Returns {translation_percent, rotation_deg_per_100m}. These are not the errors of the KITTI
+    benchmark (`kitti_errors`). A segment goes from each frame to the first frame that
     is `length` metres of true path away. Each estimated motion M is rotated to B M B^T and compared
     with the true motion. The rotation B is common to all segments and fits best: Kabsch's solution
     for the translations and rotation vectors. So neither a constant rotation between camera and
@@ -109,13 +100,9 @@ def relative_errors(
     last = np.searchsorted(along, along + length)
     first = np.flatnonzero(last < len(true))
     if not len(first):
-        return {
-            "translation_percent": np.nan,
-            "rotation_deg_per_100m": np.nan,
-            "segments": 0,
-        }
-    motion = np.linalg.inv(estimated[first]) @ estimated[last[first]]
-    true_motion = np.linalg.inv(true[first]) @ true[last[first]]
+        return {"translation_percent": np.nan, "rotation_deg_per_100m": np.nan}
+    motion = _motions(estimated, first, last[first])
+    true_motion = _motions(true, first, last[first])
     vectors = _motion_vectors(motion, length)
     true_vectors = _motion_vectors(true_motion, length)
     moments = true_vectors.T @ vectors
@@ -126,11 +113,10 @@ def relative_errors(
     turn = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
     offsets = np.linalg.norm(true_motion[:, :3, 3] - motion[:, :3, 3] @ turn.T, axis=1)
     differences = true_motion[:, :3, :3].swapaxes(1, 2) @ turn @ motion[:, :3, :3] @ turn.T
-    angle = np.linalg.norm(_rotation_vectors(differences), axis=1)
+    angle = np.linalg.norm(Rotation.from_matrix(differences).as_rotvec(), axis=1)
     return {
         "translation_percent": float(offsets.mean() / length * 100),
         "rotation_deg_per_100m": float(np.degrees(angle.mean()) / length * 100),
-        "segments": len(first),
     }
 
 
@@ -139,13 +125,8 @@ def _motion_vectors(motions: np.ndarray, length: float) -> np.ndarray:
 
     The rotation vectors, radians, are multiplied by a length, metres, so that both weigh alike.
     """
-    rotations = _rotation_vectors(motions[:, :3, :3])
+    rotations = Rotation.from_matrix(motions[:, :3, :3]).as_rotvec()
     return np.concatenate([motions[:, :3, 3], length * rotations])
-
-
-def _rotation_vectors(rotations: np.ndarray) -> np.ndarray:
-    """Rotation vectors (n, 3), radians, of rotations (n, 3, 3)."""
-    return Rotation.from_matrix(rotations).as_rotvec()
 
 
 def errors(estimated: np.ndarray, true: np.ndarray) -> dict[str, float]:
@@ -154,13 +135,11 @@ def errors(estimated: np.ndarray, true: np.ndarray) -> dict[str, float]:
     rmse, mae: metres. se3: RMSE in metres after the best rotation and shift. The other two are
     those of `relative_errors`. NaN if the path is too short or too straight.
     """
-    relative = relative_errors(estimated, true)
     return {
         "rmse": rmse(estimated, true),
         "mae": mae(estimated, true),
         "se3": ate(estimated, true, "se3"),
-        "translation_percent": relative["translation_percent"],
-        "rotation_deg_per_100m": relative["rotation_deg_per_100m"],
+        **relative_errors(estimated, true),
     }
 
 
@@ -185,8 +164,7 @@ def step_errors(estimated: np.ndarray, true: np.ndarray) -> dict[str, float]:
     do, and this is wrong by more than FAILED_ROTATION; otherwise 0. Such a turn is often a flip by
     180 degrees at walking pace, which `failed` does not see.
     """
-    steps = np.linalg.inv(estimated[:-1]) @ estimated[1:]
-    true_steps = np.linalg.inv(true[:-1]) @ true[1:]
+    steps, true_steps = _motions(estimated), _motions(true)
     rotation_error = angles(np.linalg.inv(true_steps) @ steps)
     turn = angles(true_steps)
     impossible = (angles(steps) > MAX_TURN) & (rotation_error > FAILED_ROTATION)
@@ -249,8 +227,7 @@ def _direction_error(estimated: np.ndarray, true: np.ndarray, turned: bool = Fal
 
     turned: after the one rotation that fits best.
     """
-    steps = np.linalg.inv(estimated[:-1]) @ estimated[1:]
-    true_steps = np.linalg.inv(true[:-1]) @ true[1:]
+    steps, true_steps = _motions(estimated), _motions(true)
     counts = (_length(true_steps) >= MIN_DIRECTED_STEP) & (_length(steps) > 0)
     if counts.sum() < MIN_STEPS:
         return np.nan
@@ -260,6 +237,14 @@ def _direction_error(estimated: np.ndarray, true: np.ndarray, turned: bool = Fal
         true_heading = Rotation.align_vectors(heading, true_heading)[0].apply(true_heading)
     cosine = np.clip((heading * true_heading).sum(axis=1), -1, 1)
     return float(np.degrees(np.median(np.arccos(cosine))))
+
+
+STARTS, ENDS = slice(None, -1), slice(1, None)  # of all steps
+
+
+def _motions(poses: np.ndarray, first: Any = STARTS, last: Any = ENDS) -> np.ndarray:
+    """Motions (m, 4, 4) between poses (n, 4, 4) with indices (m,); steps, if none are given."""
+    return np.linalg.inv(poses[first]) @ poses[last]
 
 
 def _length(steps: np.ndarray) -> np.ndarray:
@@ -296,8 +281,8 @@ KITTI_LENGTHS = (100, 200, 300, 400, 500, 600, 700, 800)  # metres
 KITTI_EVERY = 10  # frames between the starts of segments
 
 
-def kitti_errors(estimated: np.ndarray, true: np.ndarray) -> dict[str, Any]:
-    """Errors of the KITTI odometry benchmark: {t_rel, r_rel, segments}.
+def kitti_errors(estimated: np.ndarray, true: np.ndarray) -> dict[str, float]:
+    """Errors of the KITTI odometry benchmark: {t_rel, r_rel}.
 
     t_rel: translation error, percent. r_rel: rotation error, degrees per 100 m. The errors are
     means over segments. At every tenth frame, one segment for each of KITTI_LENGTHS starts. It ends
@@ -313,17 +298,9 @@ def kitti_errors(estimated: np.ndarray, true: np.ndarray) -> dict[str, Any]:
     fits = last < len(true)
     first, last, length = first[fits], last[fits], length[fits]
     if not len(first):
-        return {
-            "t_rel": np.nan,
-            "r_rel": np.nan,
-            "segments": 0,
-        }
-    motion = np.linalg.inv(estimated[first]) @ estimated[last]
-    true_motion = np.linalg.inv(true[first]) @ true[last]
-    error = np.linalg.inv(motion) @ true_motion
-    shares = np.linalg.norm(error[:, :3, 3], axis=1) / length
+        return {"t_rel": np.nan, "r_rel": np.nan}
+    error = np.linalg.inv(_motions(estimated, first, last)) @ _motions(true, first, last)
     return {
-        "t_rel": float(100 * shares.mean()),
+        "t_rel": float(100 * (_length(error) / length).mean()),
         "r_rel": float(100 * (angles(error) / length).mean()),
-        "segments": len(first),
     }

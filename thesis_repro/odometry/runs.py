@@ -1,19 +1,19 @@
 """Run the odometry over a sequence: one run, or many runs in one pass, which share their work."""
 
 import time
-from collections.abc import Iterable, Mapping, Sized
+from collections.abc import Mapping, Sized
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import pandas as pd
 
-from thesis_repro.data.kitti import Sequence
+from thesis_repro.data.kitti import Sequence, scales
 from thesis_repro.errors import InputError
-from thesis_repro.odometry.odometry import PROBABILITY, STATIONARY, Calls, Odometry, detect
+from thesis_repro.odometry.inputs import EQUAL
+from thesis_repro.odometry.loop import STATIONARY, Calls, Odometry, detect
 from thesis_repro.odometry.settings import THESIS, OdometrySettings
-from thesis_repro.odometry.types import EQUAL, FRAME_COLUMNS, ROTATION_COLUMNS, TIMED_PARTS
-from thesis_repro.running import program
+from thesis_repro.odometry.step import FRAME_COLUMNS, ROTATION_COLUMNS, TIMED_PARTS
 from thesis_repro.running.files import progress
 
 # Frames from which faster calls with OpenCV's bits pay. To load them takes 2 s, to compile 25 s;
@@ -73,25 +73,9 @@ def start_pose(sequence: Sequence) -> np.ndarray:
     It is the identity, as in PySLAM, unless the ground truth starts at another pose. Complete KITTI
     sequences start at the identity (up to 1e-10); excerpts do not.
     """
-    if not sequence.has_truth:
-        return np.eye(4)
-    first = sequence.poses[0]
-    if np.abs(first - np.eye(4)).max() < 1e-6:
-        return np.eye(4)
-    return first
-
-
-def scales(sequence: Sequence) -> np.ndarray:
-    """Distances between the true positions of consecutive frames, (n,), metres. The first one is 0.
-
-    Without ground truth, these are the sequence's `assumed_steps`.
-    """
-    if not sequence.has_truth:
-        return sequence.assumed_steps
-    lengths = np.zeros(len(sequence.poses))
-    for index, step in enumerate(np.diff(sequence.poses[:, :3, 3], axis=0)):
-        lengths[index + 1] = np.linalg.norm(step)
-    return lengths
+    if sequence.has_truth and np.abs(sequence.poses[0] - np.eye(4)).max() >= 1e-6:
+        return sequence.poses[0]
+    return np.eye(4)
 
 
 def run(
@@ -104,7 +88,7 @@ def run(
     """Run the odometry over a kitti.Sequence. Returns a Result.
 
     masks: see Masks. description: text of the progress bar; None for no bar. calls: functions in
-    place of OpenCV's, see odometry.Calls. Without them, a long run takes faster ones with the same
+    place of OpenCV's, see loop.Calls. Without them, a long run takes faster ones with the same
     bits.
     Raises InputError if a frame cannot be read, if a mask and its frame differ in size, if there
     are fewer masks than frames, and for another kind of sequence, settings or masks.
@@ -114,11 +98,9 @@ def run(
     odometry = Odometry(sequence.intrinsics, settings, start_pose(sequence), calls)
     step_lengths = scales(sequence)
     rows = []
-    for index in _indices(sequence, description):
-        started = time.perf_counter()
-        mask = None if masks is None else masks[index]
-        mask_seconds = time.perf_counter() - started
-        frame, mask = sequence.frame(index), inside(sequence.visible(index), mask)
+    for index in progress(range(len(sequence)), description):
+        frame = sequence.frame(index)
+        mask, mask_seconds = _masks_of_frame(sequence, index, [masks])[id(masks)]
         step = odometry.step(frame, step_lengths[index], mask)
         rows.append([*step.row().values(), mask_seconds])
     return _result(rows, settings)
@@ -133,11 +115,8 @@ def _faster_calls(frames: int, settings: OdometrySettings) -> Calls | None:
 
     if frames < FRAMES_TO_COMPILE and not opencv_exact.is_compiled():
         return None
-
-    def find(current: np.ndarray, previous: np.ndarray, threshold: float) -> tuple:
-        return opencv_exact.find_essential_matrix(current, previous, threshold, PROBABILITY)
-
-    return Calls(settings.detector or detect, sharing.track, find, opencv_exact.recover_pose)
+    search, vote = opencv_exact.find_essential_matrix, opencv_exact.recover_pose
+    return Calls(settings.detector or detect, sharing.track, search, vote)
 
 
 def run_many(
@@ -163,13 +142,13 @@ def run_many(
         )
     step_lengths = scales(sequence)
     rows: dict[str, list[list]] = {name: [] for name in runs}
-    for index in _indices(sequence, description):
+    for index in progress(range(len(sequence)), description):
         frame = sequence.frame(index)
         frame.setflags(write=False)  # so that all runs share it
         together.expect(frame, odometries.values())
-        masks_of_frame = _masks_of_frame(runs, index, sequence.visible(index))
+        made = _masks_of_frame(sequence, index, [masks for _, masks in runs.values()])
         for name, odometry in odometries.items():
-            mask, mask_seconds = masks_of_frame[id(runs[name][1])]
+            mask, mask_seconds = made[id(runs[name][1])]
             step = odometry.step(frame, step_lengths[index], mask)
             step.seconds = dict.fromkeys(TIMED_PARTS, np.nan)
             rows[name].append([*step.row().values(), mask_seconds])
@@ -177,19 +156,17 @@ def run_many(
 
 
 def _masks_of_frame(
-    runs: Mapping[Any, tuple[OdometrySettings, Masks | None]],
-    index: int,
-    visible: np.ndarray | None,
+    sequence: Sequence, index: int, masks_of_runs: list[Masks | None]
 ) -> dict[int, tuple[np.ndarray | None, float]]:
     """The mask of a frame and the seconds to make it, by the identity of the masks object."""
-    masks_of_frame: dict[int, tuple[np.ndarray | None, float]] = {id(None): (visible, 0.0)}
-    for _, masks in runs.values():
-        if masks is not None and id(masks) not in masks_of_frame:
+    visible, made = sequence.visible(index), {}
+    for masks in masks_of_runs:
+        if id(masks) not in made:
             started = time.perf_counter()
-            mask = masks[index]
+            mask = None if masks is None else masks[index]
             seconds = time.perf_counter() - started
-            masks_of_frame[id(masks)] = inside(visible, mask), seconds
-    return masks_of_frame
+            made[id(masks)] = inside(visible, mask), seconds
+    return made
 
 
 def inside(visible: np.ndarray | None, mask: Any) -> Any:
@@ -210,19 +187,6 @@ def check(sequence: Any, masks: Any) -> None:
     is_short = isinstance(masks, Sized) and len(masks) < len(sequence)
     if is_short or not isinstance(masks, Masks | None):
         raise InputError(f"masks: must be {len(sequence)} masks, one a frame, such as LabelMasks")
-
-
-def _indices(sequence: Sequence, description: str | None) -> Iterable[int]:
-    """The numbers of the frames, with a progress bar if there is a description.
-
-    A signal to stop waits for the end of a frame.
-    """
-    if description is not None:
-        yield from progress(range(len(sequence)), description)
-        return
-    for index in range(len(sequence)):
-        with program.unstopped():
-            yield index
 
 
 def _result(rows: list[list], settings: OdometrySettings) -> Result:

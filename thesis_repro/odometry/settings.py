@@ -33,6 +33,7 @@ LIMITS = {
     "levels": (0, 10),
     "shuffle_seed": (0, 2**32 - 1),
     "scale_gate": (0, math.inf),
+    "number of keypoints": (1, 2**31 - 1),  # of spread and filled
 }
 
 
@@ -75,7 +76,7 @@ class OdometrySettings:
     shuffle_seed: int | None = None
     scale_gate: float = 0.1
 
-    def of_detection(self) -> tuple:
+    def detection_values(self) -> tuple:
         """Return the settings that decide which keypoints are found."""
         return tuple(value for name, value in vars(self).items() if name not in AFTER_DETECTION)
 
@@ -101,10 +102,10 @@ class OdometrySettings:
                 )
         for field in fields(self):
             if field.name in LIMITS:
-                _check_number(field.name, getattr(self, field.name), field.type)
+                check_number(field.name, getattr(self, field.name), field.type)
 
 
-def _check_number(name: str, value: Any, kind: Any) -> None:
+def check_number(name: str, value: Any, kind: Any) -> None:
     """Raise InputError unless a setting is a number of its kind, a type, and within its LIMITS."""
     if value is None and kind == int | None:
         return

@@ -4,14 +4,14 @@ The results equal those of separate runs with OpenCV's calls, to the bit.
 """
 
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 
 import opencv_exact
 from thesis_repro.odometry import corners
-from thesis_repro.odometry.odometry import PROBABILITY, TERMINATION, Calls, Odometry
+from thesis_repro.odometry.loop import TERMINATION, Calls
 from thesis_repro.odometry.settings import THESIS, OdometrySettings
 
 
@@ -36,27 +36,26 @@ class SharedCalls:
         self.calls = Calls(
             self.detect, self.track, self.find_essential_matrix, opencv_exact.recover_pose
         )
-        self._frame: np.ndarray | None = None
-        self._forget()
+        self._start(None)
 
-    def _forget(self) -> None:
+    def _start(self, frame: np.ndarray | None) -> None:
+        self._frame = frame
         self._tracks: _Tracks | None = None
         self._detected: dict[tuple, tuple] = {}
         self._tracked: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
         self._matrices: dict[tuple, tuple] = {}
 
-    def expect(self, frame: np.ndarray, runs: Iterable[Odometry]) -> None:
-        """Forget the frame before, and track the points of all runs into this one."""
+    def expect(self, frame: np.ndarray, runs: Iterable[Any]) -> None:
+        """Forget the frame before, and track the points of all runs into this one.
+
+        runs: `Odometry`, or what has `points` in the frame before, `previous`.
+        """
         self._turn_to(frame)
-        previous = None
-        points_of_runs = {}
-        for run in runs:
-            if len(run.points):
-                previous = run.previous  # the same for all runs
-                points_of_runs[run.points.tobytes()] = run.points
-        if previous is None:
+        followed = {run.points.tobytes(): run for run in runs if len(run.points)}
+        if not followed:
             return
-        keys = np.unique(np.concatenate([_keys(points) for points in points_of_runs.values()]))
+        previous: Any = next(iter(followed.values())).previous  # the same for all runs
+        keys = np.unique(np.concatenate([_keys(run.points) for run in followed.values()]))
         points = keys.view(np.float32).reshape(-1, 2)
         self._tracks = _Tracks(previous, keys, *track(previous, frame, points))
 
@@ -67,7 +66,7 @@ class SharedCalls:
         points: np.ndarray,
         settings: OdometrySettings = THESIS,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Like `odometry.track`. Points that `expect` has tracked are looked up."""
+        """Like `loop.track`. Points that `expect` has tracked are looked up."""
         tracks = self._tracks
         is_usual = (settings.window, settings.levels) == (THESIS.window, THESIS.levels)
         if tracks is None or tracks.previous is not previous or not is_usual:
@@ -87,7 +86,7 @@ class SharedCalls:
         """Find the keypoints of the settings."""
         self._turn_to(frame)
         # the mask is remembered, too, so that no other array gets its identity
-        key = (id(mask), *settings.of_detection())
+        key = (id(mask), *settings.detection_values())
         if key not in self._detected:
             find = settings.detector or corners.detect
             self._detected[key] = mask, find(frame, settings, mask)
@@ -96,18 +95,15 @@ class SharedCalls:
     def find_essential_matrix(
         self, current: np.ndarray, previous: np.ndarray, threshold: float
     ) -> tuple[np.ndarray | None, np.ndarray | None]:
-        """Like `odometry.find_essential_matrix`."""
+        """Like `loop.find_essential_matrix`."""
         key = (current.tobytes(), previous.tobytes(), threshold)
         if key not in self._matrices:
-            self._matrices[key] = opencv_exact.find_essential_matrix(
-                current, previous, threshold, PROBABILITY
-            )
+            self._matrices[key] = opencv_exact.find_essential_matrix(current, previous, threshold)
         return self._matrices[key]
 
     def _turn_to(self, frame: np.ndarray) -> None:
         if frame is not self._frame:
-            self._frame = frame
-            self._forget()
+            self._start(frame)
 
 
 def _keys(points: np.ndarray) -> np.ndarray:
@@ -121,7 +117,7 @@ def track(
     points: np.ndarray,
     settings: OdometrySettings = THESIS,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Track points (N, 2) as `odometry.track` does, in less time.
+    """Track points (N, 2) as `loop.track` does, in less time.
 
     Points are sorted by row, so that the pixels of neighbouring points are still in the processor's
     cache. The matching error is not computed, because nothing uses it. Computing it, OpenCV also

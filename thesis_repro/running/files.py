@@ -160,27 +160,32 @@ def needed(path: str | Path, notebook: str) -> Path:
 # Progress
 
 
-class _Bar(tqdm):
-    """A progress bar over steps that a signal to stop does not break (`program.unstopped`)."""
+def _unstopped(items: Iterable) -> Iterator[Any]:
+    """Yield items for steps that a signal to stop does not break."""
+    for item in items:
+        with program.unstopped():
+            yield item
 
+
+class _Bar(tqdm):
     def __iter__(self) -> Iterator[Any]:
-        for item in super().__iter__():
-            with program.unstopped():
-                yield item
+        return _unstopped(super().__iter__())
 
 
 def progress(
     iterable: Iterable | None = None,
-    description: str = "",
+    description: str | None = "",
     total: int | None = None,
     unit: str = "frame",
     initial: int = 0,
-) -> tqdm:
-    """Return a tqdm progress bar on standard error.
+) -> Any:
+    """Return a tqdm progress bar on standard error; without a description, only the items.
 
     THESIS_REPRO_PROGRESS may name another file: `make figures` names its terminal, for the bars
     inside notebooks. Ctrl-C waits for the end of a step of the loop.
     """
+    if iterable is not None and description is None:
+        return _unstopped(iterable)
     options: dict[str, Any] = {
         "file": sys.stderr,
         "mininterval": 0.2,

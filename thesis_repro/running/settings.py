@@ -45,12 +45,9 @@ class Profile:
 
 
 def _world(
-    sequences: int, frames: int | None, train_images: int, validation_images: int
+    sequences: int, frames: int, train_images: int, validation_images: int
 ) -> dict[str, Any]:
-    """Sizes of the embedded world.
-
-    frames: of each sequence; None for its whole drive, 41 to 132 frames.
-    """
+    """Sizes of the embedded world. frames: of each sequence."""
     return {
         "sequences": tuple(f"{number:02d}" for number in range(sequences)),
         "frames": frames,
@@ -69,9 +66,9 @@ PROFILES = {
         epochs=2,
         patience=5,
         training_images=16,
-        frames=12,
-        timed_frames=5,
-        widths=(1, 5, 10, 15),
+        frames=10,
+        timed_frames=3,
+        widths=(5, 10),
         repetitions=2,
         world=_world(2, 12, 12, 4),
     ),
@@ -95,7 +92,7 @@ PROFILES = {
     # The thesis's loss needs many steps. Small batches and a higher learning rate get further in
     # the same time.
     "demo": Profile(
-        image_size=128,
+        image_size=96,
         base_filters=8,
         batch_size=2,
         learning_rate=0.004,
@@ -103,12 +100,12 @@ PROFILES = {
         epochs=16,
         patience=5,
         training_images=200,
-        frames=200,
+        frames=40,
         timed_frames=5,
         # the thesis has all 15; these show the same curve in less time
-        widths=(1, 3, 5, 7, 9, 10, 11, 13, 15),
+        widths=(1, 3, 5, 7, 10, 13, 15),
         repetitions=2,
-        world=_world(11, None, 100, 20),
+        world=_world(11, 40, 100, 20),
     ),
     "thesis": Profile(
         image_size=320,

@@ -84,7 +84,6 @@ def write_label_maps(
                 "thesis_repro.segmentation.prediction",
                 "thesis_repro.segmentation.exact",
                 "thesis_repro.data.cityscapes",
-                "thesis_repro.data.kitti",
             ),
             "arithmetic": segmentation.arithmetic(),
         }

@@ -128,23 +128,18 @@ class Batches:
                     )
         self.sets, self.batch_size, self.seed = sets, batch_size, seed
         self.epoch = 0
-        self._places = [
-            (number, index)
-            for number, (images, _) in enumerate(sets)
-            for index in range(len(images))
-        ]
+        self._pairs = [pair for images, labels in sets for pair in zip(images, labels)]
 
     def __len__(self) -> int:
-        return -(-len(self._places) // self.batch_size)
+        return -(-len(self._pairs) // self.batch_size)
 
     def __iter__(self) -> Iterator[tuple[np.ndarray, ...]]:
         """Yield the batches of the current epoch: uint8 images and uint8 label maps."""
-        order = np.arange(len(self._places))
+        order = np.arange(len(self._pairs))
         if self.seed is not None:
             order = np.random.default_rng((self.seed, self.epoch)).permutation(len(order))
         for start in range(0, len(order), self.batch_size):
-            places = [self._places[place] for place in order[start : start + self.batch_size]]
-            pairs = [[array[index] for array in self.sets[number]] for number, index in places]
+            pairs = [self._pairs[index] for index in order[start : start + self.batch_size]]
             yield tuple(map(np.stack, zip(*pairs)))
 
     def dataset(self) -> tf.data.Dataset:

@@ -12,7 +12,7 @@ import numpy as np
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.masks import dilate
 from thesis_repro.odometry import THESIS
-from thesis_repro.odometry.odometry import detect
+from thesis_repro.odometry.loop import detect
 from thesis_repro.study.sources import Source
 
 LARGEST_GRADIENT = 8 * 255  # |dx| + |dy| of 3x3 Sobel operators
@@ -28,7 +28,6 @@ class OtherFrame:
     def __init__(self, source: Source, sequence: Sequence, dilation_width: int | None) -> None:
         self.sequence = sequence
         self.masks = source.masks(sequence, dilation_width)
-        self.paths = self.masks.paths
         self.line_width = dilation_width or LINE_WIDTH
 
     def __len__(self) -> int:

@@ -21,10 +21,10 @@ class Error(NamedTuple):
 
 
 # A constant angle between camera and ground truth leaves the aligned ATE alone. It changes the
-# rotation (the field's rotational RPE over one frame) by thousandths of a degree.
+# rotational RPE by thousandths of a degree.
 ERRORS = {
     "se3": Error("aligned ATE", "m", decides=True),
-    "rotation": Error("rotation error a frame", "deg", decides=True),
+    "rotation": Error("rotational RPE, 1 frame", "deg", decides=True),
     "rmse": Error("RMSE", "m"),
     "mae": Error("MAE", "m"),
     "translation_percent": Error(f"translation error over {RELATIVE_LENGTH:g} m", "%"),
@@ -40,10 +40,8 @@ def path_errors(poses: np.ndarray, true: np.ndarray) -> dict[str, float]:
     They are those of `metrics.errors` and `metrics.step_errors`; t_rel (percent) and r_rel (degrees
     per 100 m) are those of `metrics.kitti_errors`.
     """
-    kitti = metrics.kitti_errors(poses, true)
     return {
         **metrics.errors(poses, true),
         **metrics.step_errors(poses, true),
-        "t_rel": kitti["t_rel"],
-        "r_rel": kitti["r_rel"],
+        **metrics.kitti_errors(poses, true),
     }

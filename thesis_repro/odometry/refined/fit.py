@@ -16,7 +16,7 @@ from opencv_exact import epipolar
 from opencv_exact.compiling import compiled, inlined
 from thesis_repro.odometry.refined import matrices
 from thesis_repro.odometry.refined.normal_equations import normal_equations
-from thesis_repro.odometry.types import Matches, Motion
+from thesis_repro.odometry.step import Matches, Motion
 
 MIN_MATCHES = 5  # that determine a motion
 MAX_ITERATIONS = 10
@@ -95,7 +95,6 @@ def refine(
     with another heading (see SAME_MOTION_COSINE) is another motion and is not used. The sign of the
     given translation is kept, because the cost does not depend on it.
     """
-    assert matches.inliers is not None
     threshold = matches.threshold
     points = columns(matches)
     start = np.ascontiguousarray(rotation), np.ascontiguousarray(translation)
@@ -106,13 +105,10 @@ def refine(
     second = _rounds(*second, points, _support(*second, points, threshold), threshold)
     first_cost, _, _ = normal_equations(*first, points, threshold / 2, False)
     second_cost, _, _ = normal_equations(*second, points, threshold / 2, False)
-    rotation, heading = first
-    is_same_motion = abs(second[1] @ heading) > SAME_MOTION_COSINE
-    if is_same_motion and second_cost < LOWER_COST * first_cost:
-        rotation, heading = second
-    if heading @ translation >= 0:
-        return rotation, heading
-    return rotation, -heading
+    is_same_motion = abs(second[1] @ first[1]) > SAME_MOTION_COSINE
+    is_better = is_same_motion and second_cost < LOWER_COST * first_cost
+    rotation, heading = second if is_better else first
+    return rotation, (heading if heading @ translation >= 0 else -heading)
 
 
 def _deviations(
@@ -169,15 +165,8 @@ def near_epipolar_lines(essential, points, limit):
 @compiled
 def _support(r, t, points, threshold):
     """The points (4, N) that support a motion."""
-    mask = _near(r, t, points, SUPPORT_THRESHOLDS * threshold)
-    support = np.empty((4, mask.sum()))
-    place = 0
-    for k in range(len(mask)):
-        if mask[k]:
-            for row in range(4):
-                support[row, place] = points[row, k]
-            place += 1
-    return support
+    supporting = _near(r, t, points, SUPPORT_THRESHOLDS * threshold)
+    return points[:, np.flatnonzero(supporting)]
 
 
 @compiled

@@ -16,7 +16,7 @@ import numpy as np
 
 from thesis_repro.odometry.refined.fit import RefinedMotion, fit, near
 from thesis_repro.odometry.refined.guided import ransac_with_prior
-from thesis_repro.odometry.types import Matches
+from thesis_repro.odometry.step import Matches
 
 MAX_ROTATION_CHANGE, MAX_HEADING_CHANGE = 1.5, 20.0  # degrees
 MAX_FIRST_ROTATION = 5.0  # degrees: KITTI's cars turn by up to 4.8 a frame
@@ -90,8 +90,6 @@ def check_consistency(
     if not _is_determined(motion):
         expected = replace(motion, rotation=rotation, translation=translation)
         return expected, prior, NOT_DETERMINED
-    # a fitted motion has both
-    assert motion.rotation is not None and motion.translation is not None
     # copies, because the caller may change what a step returns
     return motion, MotionPrior(motion.rotation.copy(), motion.translation.copy(), scale), flag
 
@@ -117,7 +115,6 @@ def is_consistent(motion: RefinedMotion, scale: float, prior: MotionPrior) -> bo
 
     scale: length of the step, metres.
     """
-    assert motion.rotation is not None and motion.translation is not None
     if not _is_determined(motion):
         return False
     difference = prior.expected_rotation(scale).T @ motion.rotation

@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 
 from thesis_repro.errors import need
-from thesis_repro.odometry import types
+from thesis_repro.odometry import inputs
 from thesis_repro.odometry.settings import THESIS, OdometrySettings
-from thesis_repro.odometry.types import NO_POINTS, Matches, Motion, Step
+from thesis_repro.odometry.step import NO_POINTS, Estimator, Matches, Motion, Step
 
 PROBABILITY = 0.999  # that RANSAC has tried a sample without wrong matches
 TERMINATION = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 0.01)  # of the tracker
@@ -121,9 +121,14 @@ class VoteOfAll(NamedTuple):
     calls: Calls = OPENCV
 
     def motion(self, essential: np.ndarray, matches: Matches, scale: float, moves: bool) -> Motion:
-        """Return the motion of a step (see types.Estimator)."""
-        voted = self.calls.recover_pose(essential, matches.current, matches.previous)
-        return types.motion_of_vote(*voted)
+        """Return the motion of a step (see step.Estimator).
+
+        If no match votes, PySLAM keeps the first of the four motions. Which one that is depends on
+        the processor, so the motion gets a flag.
+        """
+        current, previous = matches.current, matches.previous
+        votes, rotation, translation = self.calls.recover_pose(essential, current, previous)
+        return Motion(rotation, translation, votes, "" if votes else "no votes")
 
 
 class Odometry:
@@ -143,15 +148,15 @@ class Odometry:
         Raises InputError for another matrix, and for a start that is no pose.
         """
         need("settings", settings, OdometrySettings)
-        self.intrinsics = types.camera_matrix(intrinsics)
+        self.intrinsics = inputs.camera_matrix(intrinsics)
         self.settings = settings
         self.calls = calls or OPENCV._replace(detect=settings.detector or detect)
-        self.estimator: types.Estimator = (settings.estimator or VoteOfAll)(self.calls)
-        self.pose = types.start_pose(start)
+        self.estimator: Estimator = (settings.estimator or VoteOfAll)(self.calls)
+        self.pose = inputs.start_pose(start)
         self.count = 0  # of frames so far
-        self.previous: np.ndarray | None = None  # the frame in which self.points lie
-        self.points = NO_POINTS
-        self.skipped_metres = 0.0  # moved during frames that were skipped
+        self.previous: np.ndarray | None = None  # the last frame that was not skipped
+        self.points = NO_POINTS  # in it
+        self.metres = 0.0  # moved since then
 
     def step(self, frame: Any, scale: Any = 0.0, mask: Any = None) -> Step:
         """Take the next frame. Returns a Step.
@@ -160,21 +165,18 @@ class Odometry:
         size, uint8 or bool; keypoints lie only where it is not 0.
         Raises InputError for a frame, scale or mask of another kind.
         """
-        frame = types.gray_frame(frame, self.count, self.intrinsics, self.previous)
-        mask = types.allowed_pixels(mask, self.count, frame)
-        step = Step(self.count, types.step_length(scale, self.count) + self.skipped_metres)
+        frame = inputs.gray_frame(frame, self.count, self.intrinsics, self.previous)
+        mask = inputs.allowed_pixels(mask, self.count, frame)
+        self.metres += inputs.step_length(scale, self.count)
+        step = Step(self.count, self.metres, flags=inputs.reasons_to_skip(frame, self.previous))
         self.count += 1
-        step.flags += types.reasons_to_skip(frame, self.previous)
-        if step.flags:
-            self.skipped_metres = step.scale
-        else:
-            self.skipped_metres = 0.0
+        if not step.flags:
             if step.frame > 0:
                 self._track(step, frame)
             if step.points:
                 self._estimate(step)
             self._detect(step, frame, mask)
-            self.previous = frame
+            self.previous, self.metres = frame, 0.0
         step.pose = self.pose.copy()
         return step
 
@@ -186,8 +188,7 @@ class Odometry:
             return
         with step.timed("track"):
             tracked, was_found = self.calls.track(self.previous, frame, self.points, self.settings)
-        step.previous = self.points[was_found]
-        step.current = tracked[was_found]
+        step.previous, step.current = self.points[was_found], tracked[was_found]
 
     def _estimate(self, step: Step) -> None:
         """Estimate the motion from the matched points, and move the pose (Section 3.7.3)."""
@@ -217,10 +218,8 @@ class Odometry:
             step.motion = self.estimator.motion(matrix, step.matches, step.scale, moves)
         if moves:
             self._move(step)
-        elif agree_by_chance:
-            step.flags.append("no agreement")
         else:
-            step.flags.append(STATIONARY)
+            step.flags.append("no agreement" if agree_by_chance else STATIONARY)
 
     def _move(self, step: Step) -> None:
         """Move the pose by the motion over the step's length (Equations 2.2 and 2.3)."""

@@ -1,0 +1,61 @@
+"""Execute every notebook once, on the smallest profile, as they are in git."""
+
+import os
+from pathlib import Path
+
+import nbformat
+from cells import NOTEBOOKS
+from drawn import END
+from nbclient import NotebookClient
+
+from thesis_repro.running.settings import PREFIX, ROOT
+
+# what a kernel sees of this process's variables: nothing that the Makefile sets
+KEPT = ("PATH", "HOME", "LANG", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
+# executed by every kernel
+STARTUP = """import sys
+sys.path.append({tests!r})
+from drawn import Watch
+Watch(get_ipython(), {folder!r})
+"""
+# that cells show; those that are saved are as usual
+SMALL_PICTURES = """
+get_config().InlineBackend.print_figure_kwargs = {"bbox_inches": None, "dpi": 40}
+"""
+
+
+def run_of(folder):
+    """The settings of the run in a folder, as variables.
+
+    Without worker processes, which would each load what is compiled.
+    """
+    folders = {f"{PREFIX}{name.upper()}": str(folder / name) for name in ("build", "figures")}
+    return folders | {f"{PREFIX}PROFILE": "smoke", f"{PREFIX}JOBS": "1"}
+
+
+def execute(folder, world):
+    """Execute every notebook in its folder by what nbconvert uses, and write it with its outputs.
+
+    This spares the start of nbconvert, three seconds each. world: a rendered one, which is not
+    rendered again.
+    """
+    run = folder / "build/embedded-smoke"
+    (run / "notebooks").mkdir(parents=True)
+    (run / "checked").touch()  # as if make had checked the data
+    (folder / "build/world-smoke").symlink_to(world)
+    profile = folder / "ipython/profile_default"
+    (profile / "startup").mkdir(parents=True)
+    watch = STARTUP.format(tests=str(Path(__file__).parent), folder=str(folder))
+    (profile / "startup/watch.py").write_text(watch)
+    (profile / "ipython_kernel_config.py").write_text(SMALL_PICTURES)
+    variables = {name: os.environ[name] for name in KEPT if name in os.environ}
+    variables |= {"IPYTHONDIR": str(folder / "ipython"), "PYTHONPATH": str(ROOT)} | run_of(folder)
+    for name in NOTEBOOKS:
+        notebook = nbformat.read(ROOT / "notebooks" / name, 4)
+        notebook.cells.append(nbformat.v4.new_code_cell(END))
+        place = {"metadata": {"path": str(ROOT / "notebooks")}}
+        client = NotebookClient(notebook, kernel_name="python3", resources=place)
+        client.execute(env=variables | {"WATCHED": name[:2]})
+        nbformat.write(notebook, run / "notebooks" / name)
+        if name == NOTEBOOKS[0]:
+            (run / "drives").touch()  # as if make had rendered the drives
