@@ -21,13 +21,12 @@ def one_line(text: object) -> str:
 
     Line breaks and control characters become escape sequences such as \n.
     """
-    letters = []
-    for letter in str(text):
-        if letter.isprintable():
-            letters.append(letter)
-        else:
-            letters.append(letter.encode("unicode_escape", "surrogatepass").decode())
-    return "".join(letters)
+    return "".join(
+        letter
+        if letter.isprintable()
+        else letter.encode("unicode_escape", "surrogatepass").decode()
+        for letter in str(text)
+    )
 
 
 class InputError(ValueError):

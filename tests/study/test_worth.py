@@ -185,8 +185,8 @@ def test_steps_without_lengths_are_all_kept_and_short_ones_are_not():
     street = Street(4)
     street.poses[2:, :3, 3] = street.poses[1, :3, 3]  # the last two steps are short
     assert (worth.worth(street, {("all", 0): (THESIS, None)})["steps"] == 1).all()
-    street.has_truth, street.assumed_steps = False, np.array([0.0, 1, 1, 1])
+    street.has_truth, street.speed = False, None
     assert (worth.worth(street, {("all", 0): (THESIS, None)})["steps"] == 3).all()
-    street.folder, street.assumed_steps = "street", np.zeros(4)
+    street.folder, street.speed, street.times = "street", 0.0, np.arange(4)
     with pytest.raises(InputError):
         worth.worth(street, {("all", 0): (THESIS, None)})

@@ -36,7 +36,7 @@ def angles(numbers, equivalent):
 
 def test_independent_keypoints_tell_as_much_as_their_number_and_saturated_ones_less():
     numbers = (100, 400, 0)
-    for equivalent in (lambda n: n, lambda n: 100 * (n / 100) ** 0.5):
+    for equivalent in (lambda n: n, lambda n: 400 * (n / 400) ** 0.5):
         table = saturation.table(angles(numbers, equivalent))
         assert list(table["drawn"]) == [100, 400, "all"]
         for column in table.columns[3:]:
