@@ -109,6 +109,7 @@ def test_without_ground_truth_there_are_no_errors(
     assert (cv2.imread("path.png") is not None) == ("--plot" in options)
 
 
+@pytest.mark.slow
 def test_public_names():
     assert all(hasattr(tr, name) for name in tr.__all__) and not hasattr(tr, "mistyped")
     assert tr.__version__ == metadata.version("thesis-repro")

@@ -17,6 +17,8 @@ from thesis_repro.report import study_report as report
 from thesis_repro.study import sources, worth
 from thesis_repro.study.plan import Study
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def street(tmp_path, monkeypatch):

@@ -83,6 +83,7 @@ def worths_of(names, scenes):
     return table.rdiv(table["independent"], axis=0)
 
 
+@pytest.mark.slow
 def test_copies_tell_nothing_which_only_fields_see_and_twice_the_noise_a_quarter():
     table = worths_of(["independent", "each twice", "twice the noise"], 250)
     assert table["twice the noise"].between(0.19, 0.32).all(), table
