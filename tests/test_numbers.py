@@ -5,6 +5,7 @@ read from the tables in git when the test runs. So it fails if a number of the t
 changes, and if a text has a number that no claim and no fact covers.
 """
 
+import itertools
 import re
 from functools import cache
 
@@ -157,6 +158,12 @@ def row_of_worth(choice):
     return [*worth(choice), cell("real/worth", "a keypoint tells", choice=choice, drawn="400")]
 
 
+def told(choice, drawn):
+    """Return the equivalent number of keypoints of a choice, for the direction and by fields."""
+    column = "tell as much as, direction, by fields"
+    return cell("real/saturation", column, choice=choice, drawn=drawn).partition(" ")[0]
+
+
 def short_time():
     """Return the CPU time with 200 spread keypoints, as a share of that with all."""
     times = [
@@ -300,6 +307,14 @@ def claims_of_answer():
         ("On the thesis's masks it is {} and {} times", worth("masks")[::3]),
         ("one of four intervals reaches {},", worth("masks", "points")[-1:]),
         ("masks have {} ({}-{}) and {} ({}-{}),", worth("masks", "points")),
+        (
+            "all keypoints are {}, 400 spread ones {}, those on the masks {} (",
+            [
+                told("random keypoints", "all"),
+                told("spread keypoints", "400"),
+                told("masks", "all"),
+            ],
+        ),
         *(
             (f"| {name} | {{}} ({{}}-{{}}) | {{}} ({{}}-{{}}) | {{}} |", row_of_worth(choice))
             for name, choice in {
@@ -325,7 +340,7 @@ def claims_of_answer():
         ),
         ("| failed runs: masks, all keypoints | {}, {} | | {}, {} | |", failed()),
         ("the rotation ratio is {} ({}-{}).", without_01("rotation")),
-        ("higher, by {} to {} %.", excess()),
+        ("on each other street, by {} to {} %, and", excess()),
         ("at every width from 1 ({} times) to 15 ({} times;", sweep()),
         (
             "a mean of {} % (median {} %), lower on {} of 8.",
@@ -447,7 +462,8 @@ FACTS = {
     "docs/answer.md": """
         rotational RPE, 1 frame; 00, 01, 02, 05, 06 and 07; drives 0005 and 0095; width 10; street 01; 6 of 11.;
         best of 15; all 16 runs; One of 400 keypoints; Of 400 keypoints; and 6 or fewer;
-        the 15 count; without 0095, it is; failed runs of 40; In drive 0005; more than 0.15 degrees; All 23 are;
+        the 15 count; without 0095 it is; with [100, 200 and all];
+        ones (of 400; 400 spread ones; failed runs of 40; In drive 0005; more than 0.15 degrees; All 23 are;
         on 01, a ramp; 16 x 5 fields; on 07 are; of 180 degrees; failed runs of 32; 90 % interval;
         1.25 for the; 1.1 for the; 200, 400 and 800 spread; and 400 and 800 random; [Table 4.2];
         [LIBVISO2]; RMSE of 15,;
@@ -511,6 +527,19 @@ def test_what_texts_say_of_streets_in_words():
         assert masks[f"worth, {motion}, by fields"].endswith("8 of 8 below 1")
     upper = [float(worth("masks", split)[end]) for split in ("fields", "points") for end in (2, 5)]
     assert [end < 1 for end in upper] == [True, True, True, False]
+
+
+def test_other_numbers_of_keypoints_than_400():
+    rows = table("real/worth")
+    of_masks = rows[(rows["choice"] == "masks") & (rows["drawn"] != "400")]
+    assert set(of_masks["drawn"]) == {"100", "200", "all"}
+    assert (of_masks["a keypoint tells"] == "less").all()
+    # the check: a second draw of random keypoints has a worth of 1
+    of_random = rows[rows["choice"] == "random keypoints"]
+    for motion, split in itertools.product(("direction", "rotation"), ("fields", "points")):
+        for text in of_random[f"{motion}, by {split}"]:
+            _, low, high = map(float, ratio(text))
+            assert low <= 1 <= high
 
 
 @pytest.mark.parametrize(
