@@ -76,7 +76,7 @@ def figure(worths) -> Figure:
     drawing, panels = style.new_figure(1, 2, sharey=True, height=3.8)
     for panel, motion in zip(panels, SHOWN, strict=True):
         ends = rows["keypoints"].min(), rows["keypoints"].max()
-        panel.plot(ends, ends, color=style.GRAY, linewidth=0.8, label="nothing shared")
+        panel.plot(ends, ends, color=style.GRAY, linewidth=0.8, label="each as much as one of 400")
         for choice, color in CURVES.items():
             of_choice = rows[rows["choice"] == choice]
             for split, dash in zip(SPLIT, ("o-", "o:"), strict=True):
@@ -89,7 +89,7 @@ def figure(worths) -> Figure:
         ticks = [100, 200, 400, 800, 1900]
         panel.set_xticks(ticks, list(map(str, ticks)))
         panel.minorticks_off()
-    ticks = [25, 50, 100, 200, 400, 800, 1600]
+    ticks = [6, 12, 25, 50, 100, 200, 400, 800, 1600]
     panels[0].set_yticks(ticks, list(map(str, ticks)))
     panels[0].set_ylabel("equivalent number of random ones")
     style.legend_below(drawing, panels[:1], 3)

@@ -61,17 +61,13 @@ def text(runs: pd.DataFrame, table: pd.DataFrame, data: str, embedded: bool, mor
         fewest=compare.MIN_SEQUENCES,
         far=compare.FAR_OFF,
         thesis_width=CONTROL_WIDTH,
-        ratios=_markdown(_ratios(rows)),
-        spread=_markdown(_spread(runs)),
-        failures=_markdown(_failures(rows)),
-        controls=_markdown(verdicts.rename(compare.METHODS).unstack("source").reset_index()),
-        pairs=_markdown(_pairs(masked[masked["reference"] == "masked"])),
-        stability=_markdown(_stability(runs)),
+        ratios=style.markdown(_ratios(rows)),
+        spread=style.markdown(_spread(runs)),
+        failures=style.markdown(_failures(rows)),
+        controls=style.markdown(verdicts.rename(compare.METHODS).unstack("source").reset_index()),
+        pairs=style.markdown(_pairs(masked[masked["reference"] == "masked"])),
+        stability=style.markdown(_stability(runs)),
     )
-
-
-def _markdown(table: pd.DataFrame) -> str:
-    return style.markdown(table) if len(table) else ""
 
 
 def _ratios(rows: pd.DataFrame) -> pd.DataFrame:

@@ -308,28 +308,29 @@ def measure(
     options: of `choices`.
     """
     sources, numbers = list(sources), list(numbers)
-    files: dict[Path, tuple] = {}
-    for sequence in sequences:
-        inputs = {
-            "sequence": provenance.digest_of_files(sequence.files),
-            "sources": [source.record(sequence.name) for source in sources],
-            "width": width,
-            "options": options,
-            "code": provenance.digest_of_code(
-                *CODE, "thesis_repro.study.methods", "thesis_repro.study.worth"
-            ),
-            **provenance.made_with("opencv", "numpy", "numba"),
-        }
-        stage = provenance.stage(folder / sequence.name, **inputs)
-        for number in numbers:
-            files[stage / f"{number}.csv"] = sequence, sources, width, number, options
-    waiting = [(file, *call) for file, call in files.items() if not file.is_file()]
-    with open_pool(processes, scheduler) as pool:
-        for _ in pool.run(_measure_one, waiting):
-            pass
-    return pd.concat(
-        [pd.read_csv(file, dtype={"sequence": str}) for file in files], ignore_index=True
+    code = provenance.digest_of_code(
+        *CODE, "thesis_repro.study.methods", "thesis_repro.study.worth"
     )
+    calls: list[tuple] = []
+    for sequence in sequences:
+        stage = provenance.stage(
+            folder / sequence.name,
+            sequence=provenance.digest_of_files(sequence.files),
+            sources=[source.record(sequence.name) for source in sources],
+            width=width,
+            options=options,
+            code=code,
+            **provenance.made_with("opencv", "numpy", "numba"),
+        )
+        calls += [
+            (stage / f"{number}.csv", sequence, sources, width, number, options)
+            for number in numbers
+        ]
+    with open_pool(processes, scheduler) as pool:
+        for _ in pool.run(_measure_one, [call for call in calls if not call[0].is_file()]):
+            pass
+    tables = [pd.read_csv(file, dtype={"sequence": str}) for file, *_ in calls]
+    return pd.concat(tables, ignore_index=True)
 
 
 def _measure_one(
