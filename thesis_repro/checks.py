@@ -176,9 +176,8 @@ def sequence_warnings(sequence: kitti.Sequence) -> list[str]:
 def _step_warnings(sequence: kitti.Sequence) -> list[str]:
     """Warn of steps longer or faster than what drives, and of gaps in the times."""
     intervals = np.diff(sequence.times)
-    lengths, unit = sequence.assumed_steps[1:], "times in seconds, and the speed in metres a second"
+    lengths, unit = kitti.scales(sequence)[1:], "times in seconds, and the speed in metres a second"
     if sequence.has_truth:
-        lengths = np.linalg.norm(np.diff(sequence.poses[:, :3, 3], axis=0), axis=1)
         unit = "true positions in metres, and times in seconds"
     impossible = lengths > MAX_STEP
     if sequence.has_times:

@@ -21,13 +21,12 @@ def one_line(text: object) -> str:
 
     Line breaks and control characters become escape sequences such as \n.
     """
-    letters = []
-    for letter in str(text):
-        if letter.isprintable():
-            letters.append(letter)
-        else:
-            letters.append(letter.encode("unicode_escape", "surrogatepass").decode())
-    return "".join(letters)
+    return "".join(
+        letter
+        if letter.isprintable()
+        else letter.encode("unicode_escape", "surrogatepass").decode()
+        for letter in str(text)
+    )
 
 
 class InputError(ValueError):
@@ -42,6 +41,13 @@ class InputError(ValueError):
     def _render_traceback_(self) -> list[str]:
         """Let IPython show only the message, without a traceback."""
         return [f"InputError: {self}"]
+
+
+def cause(error: Exception) -> str:
+    """Return why something failed as one line; of other errors than bad input with their name."""
+    if isinstance(error, InputError):
+        return str(error)
+    return f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
 
 
 def need(name: str, value: object, kind: Any) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 
 from thesis import few_keypoints
+from thesis_repro.odometry.estimators import COMPARED
 from thesis_repro.report import texts
 from thesis_repro.report.worth import cell
 from thesis_repro.study import compare, methods
@@ -91,7 +92,8 @@ def _failed(runs: pd.DataFrame) -> pd.Series:
 def _errors(chosen: pd.DataFrame, reference: pd.DataFrame) -> dict:
     """Return failures, ratios of errors to all keypoints, and rule 5, for each estimator."""
     row, no_worse = {}, []
-    for estimator, title in ESTIMATORS.items():
+    for estimator in COMPARED:
+        title = ESTIMATORS[estimator]
         of_choice = chosen[chosen["estimator"] == estimator]
         of_all = reference[reference["estimator"] == estimator]
         failing, failing_of_all = map(_failing_streets, (of_choice, of_all))

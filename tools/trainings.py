@@ -134,7 +134,7 @@ def rows(runs, comparison, source, facts):
     own = compare.of_source(runs, source.name)
     is_masked = (comparison["source"] == source.name) & (comparison["method"] == "masked")
     table = comparison[is_masked & comparison["tested"]]
-    for estimator in jobs.ESTIMATORS:
+    for estimator in ("thesis", DECIDING):
         pairs = table[table["estimator"] == estimator]
         ratios = pairs[pairs["reference"] == "baseline"].set_index("metric")
         row = {
@@ -148,7 +148,9 @@ def rows(runs, comparison, source, facts):
                 row[f"{metric}_{end}"] = ratios.loc[metric, end]
         row["verdict"] = compare.overall(ratios.loc[list(compare.JUDGING_METRICS), "verdict"])
         if estimator == DECIDING:
-            judging = compare.against(pairs, compare.SEGMENTATION_FREE_CONTROLS)
+            judging = pairs[
+                pairs["decides"] & pairs["reference"].isin(compare.SEGMENTATION_FREE_CONTROLS)
+            ]
             verdicts = judging.groupby("reference")["verdict"].agg(compare.overall)
             row["controls_beaten"] = (verdicts == compare.LOWER).sum()
         else:

@@ -16,12 +16,12 @@ from thesis import ablations, artefacts, audit_of_tables, domain_gap, timing
 from thesis.audit import measurement
 from thesis_repro.data import cityscapes
 from thesis_repro.data.cityscapes import ID, read_label_map
-from thesis_repro.data.kitti import Sequence
+from thesis_repro.data.kitti import TRUE_LABELS, Sequence
 from thesis_repro.mask_files import LabelMasks
 from thesis_repro.running.settings import Settings
 from thesis_repro.segmentation import augmentation, training
 from thesis_repro.study.jobs import CONTROL_WIDTH
-from thesis_repro.study.methods import METHODS, true_labels
+from thesis_repro.study.methods import METHODS
 from thesis_repro.study.sources import Source
 
 SMALL = [ID[name] for name in ("pole", "traffic light", "traffic sign", "person")]
@@ -63,7 +63,7 @@ def boundaries(drives: list[Sequence], labels: Path, pairs: int) -> pd.DataFrame
     """
     rows = []
     for drive in drives:
-        own, exact = labels / drive.name, true_labels(drive.root, drive.name)
+        own, exact = labels / drive.name, drive.folder / TRUE_LABELS
         for index in range(0, len(drive), max(1, len(drive) // pairs)):
             name = drive.frame_paths[index].name
             thin_map = read_label_map((exact if exact.is_dir() else own) / name)
@@ -75,7 +75,7 @@ def boundaries(drives: list[Sequence], labels: Path, pairs: int) -> pd.DataFrame
 
 def masks_by_name(drive: Sequence, labels: Path) -> dict[str, Any]:
     """Return the masks of a sequence that place keypoints differently, for `ablations.tracks`."""
-    own_folder, true_folder = labels / drive.name, true_labels(drive.root, drive.name)
+    own_folder, true_folder = labels / drive.name, drive.folder / TRUE_LABELS
     by_name: dict[str, Any] = {
         "all keypoints": [None] * len(drive),
         "masks": LabelMasks(own_folder, drive, CONTROL_WIDTH),
@@ -92,7 +92,7 @@ def right_pixels(settings: Settings, drives: list[Sequence], labels: Path) -> pd
     rows = []
     for drive in drives:
         whole = Sequence(settings.kitti, drive.name).subset(settings.sizes.frames).subset(FRAMES)
-        true_folder = true_labels(settings.kitti, drive.name)
+        true_folder = drive.folder / TRUE_LABELS
         for index, name in enumerate(whole.label_names if true_folder.is_dir() else ()):
             predicted = read_label_map(labels / drive.name / name)
             shares = right_shares(predicted, read_label_map(true_folder / name), whole.frame(index))

@@ -326,7 +326,7 @@ def of_ablations(runs: pd.DataFrame) -> list[dict[str, Any]]:
 
 def _of_shuffles(runs: pd.DataFrame) -> list[dict[str, Any]]:
     """Return row 14."""
-    spread = compare.shuffle_spread(runs[runs["estimator"].isin(compare.ESTIMATORS)])
+    spread = compare.shuffle_spread(runs[runs["estimator"].isin(ESTIMATORS)])
     text = "highest over lowest error of all keypoints, shuffled"
     return [
         ratio("14", text, factors, metric="RMSE", estimator=estimator)

@@ -138,7 +138,7 @@ def figure_paths(
         of_sequence = {run: path for (sequence, run), path in paths.items() if sequence == name}
         factor = _draw_paths(above, below, truths[name], of_sequence, runs)
         # two digits that are not zero, such as 0.0078
-        mean, *span = (f"{value:g}" for value in map(float, map("{:.2g}".format, errors.loc[name])))
+        mean, *span = (f"{float(f'{value:.2g}'):g}" for value in errors.loc[name])
         repeated = f" ({'-'.join(span)})" if len(runs) > 1 else ""
         enlarged = f"errors x{factor} in the path" if factor > 1 else "errors not enlarged"
         column, special = SPECIAL.get(runs["method"].iloc[0], ("frames", ""))

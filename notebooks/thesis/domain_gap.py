@@ -8,7 +8,6 @@ import numpy as np
 import pandas as pd
 
 from thesis_repro.data import cityscapes, kitti
-from thesis_repro.study.methods import true_labels
 
 IMAGES = 100  # most images of a domain
 FRAMES = "the odometry's frames"  # the domain for which masks are made
@@ -57,7 +56,7 @@ def labelled_frames(drives: list[kitti.Sequence]) -> list[cityscapes.Pair]:
     """Return evenly spread frames of sequences with their exact label maps; none for real data."""
     pairs = []
     for drive in drives:
-        label_folder = true_labels(drive.root, drive.name)
+        label_folder = drive.folder / kitti.TRUE_LABELS
         if label_folder.is_dir():
             count = min(len(drive), max(1, IMAGES // len(drives)))
             middles = (np.arange(count) + 0.5) * len(drive) / count  # of equal parts of the drive

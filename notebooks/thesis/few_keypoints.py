@@ -190,10 +190,8 @@ def summary(rows: pd.DataFrame, times: pd.DataFrame | None = None) -> pd.DataFra
     milliseconds = {} if times is None else times.set_index(keys)["milliseconds"]
     lines = []
     for (choice, number), chosen in rows.groupby(keys, sort=False):
-        line: dict[str, Any] = {
-            "keypoints": f"{chosen['keypoints'].iloc[0]:.0f}",
-            "how chosen": LABELS[choice],
-        }
+        mean = chosen["keypoints"].iloc[0]
+        line: dict[str, Any] = {"keypoints": f"{mean:.0f}", "how chosen": LABELS[choice]}
         for row in chosen.itertuples():
             ratio, low, high = map(texts.number, (row.ratio, row.low, row.high))
             name = f"{ERRORS[row.error]}, {ESTIMATORS[row.estimator]}"

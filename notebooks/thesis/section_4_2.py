@@ -49,14 +49,16 @@ NULL = "change (%), one run each, if masks did nothing"
 def is_decisive(job: Job, tested: int) -> bool:
     """Return whether a run is made in the embedded world, where no conclusion rests on the others.
 
-    Each job is run once. Section 4.2 compares all keypoints, masks of the `tested` width and
-    plainly reduced keypoints: these are repeated. The masks that published systems use
-    (`methods.AS_SLAM_SYSTEMS`) are compared on real frames only.
+    Each job is run once, and controls with the refined estimator alone. Section 4.2 compares all
+    keypoints, masks of the `tested` width and plainly reduced keypoints: these are repeated. The
+    masks that published systems use (`methods.AS_SLAM_SYSTEMS`) are compared on real frames only.
     """
     if job.method in AS_SLAM_SYSTEMS:
         return False
+    if job.method not in ("baseline", "masked", "reduced"):
+        return job.repetition == 0 and job.estimator == "refined"
     is_tested = job.method == "masked" and job.dilation_width == tested
-    return job.repetition == 0 or is_tested or job.method in ("baseline", "reduced")
+    return job.repetition == 0 or is_tested or job.method != "masked"
 
 
 def reduced_jobs(best: pd.DataFrame, repetitions: int = 1) -> list[Job]:

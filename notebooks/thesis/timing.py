@@ -83,33 +83,18 @@ def measure(sequence: Sequence, model: Any, width: int = CONTROL_WIDTH) -> pd.Da
         times.append(time.perf_counter())
         seconds.append(np.diff(times))
     stages = pd.DataFrame(seconds, columns=["read", "segmentation", "mask"])
-    methods = {"all keypoints": (None, ["read"]), f"masked, width {width}": (made, list(stages))}
-    tables = []
-    for method, (frame_masks, earlier) in methods.items():
+    medians = {}
+    for method, frame_masks in {"all keypoints": None, f"masked, width {width}": made}.items():
         steps = odometry.run(sequence, masks=frame_masks).frames
-        table = stages[earlier].assign(
+        table = stages.assign(
             detection=steps["detect_seconds"],
             tracking=steps["track_seconds"],
             pose=steps["essential_seconds"] + steps["pose_seconds"],
         )
-        medians = 1000 * table[WARM_UP:].median()
-        tables.append(pd.DataFrame({"method": method, "milliseconds": medians}))
-    columns = ["method", "stage", "milliseconds"]
-    return pd.concat(tables).rename_axis("stage").reset_index()[columns]
-
-
-def table_budget(measured: pd.DataFrame) -> pd.DataFrame:
-    """Return the milliseconds of each stage for one frame, one column a method.
-
-    The last rows have their sum and the frames a second. measured: of `measure`.
-    """
-    table = measured.pivot(index="stage", columns="method", values="milliseconds")
-    table = table.loc[measured["stage"].unique(), measured["method"].unique()]
-    total = table.sum()
-    summary = pd.DataFrame({"all stages (ms)": total, "frames a second": 1000 / total}).T
-    stages = table.round(2).rename("{} (ms)".format)
-    table = pd.concat([stages, summary.round(1)])
-    return table.rename_axis("stage", axis=0).rename_axis(None, axis=1).reset_index()
+        medians[method] = 1000 * table[WARM_UP:].median()
+    medians["all keypoints"][["segmentation", "mask"]] = np.nan
+    by_stage = pd.DataFrame(medians).stack().dropna().rename_axis(["stage", "method"])
+    return by_stage.rename("milliseconds").reset_index()[["method", "stage", "milliseconds"]]
 
 
 def recorded(settings: Settings, name: str, measured: pd.DataFrame | None = None) -> pd.DataFrame:

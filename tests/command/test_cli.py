@@ -18,6 +18,7 @@ from thesis_repro.command.options import named as named_options
 from thesis_repro.data import cityscapes
 from thesis_repro.data.trajectories import read_poses
 from thesis_repro.masks.kinds import KINDS, Kind
+from thesis_repro.odometry.estimators import COMPARED, ESTIMATORS, Entry
 from thesis_repro.running import provenance
 from thesis_repro.running.files import write_png
 
@@ -108,6 +109,7 @@ def test_without_ground_truth_there_are_no_errors(
     assert (cv2.imread("path.png") is not None) == ("--plot" in options)
 
 
+@pytest.mark.slow
 def test_public_names():
     assert all(hasattr(tr, name) for name in tr.__all__) and not hasattr(tr, "mistyped")
     assert tr.__version__ == metadata.version("thesis-repro")
@@ -181,6 +183,14 @@ def test_a_new_kind_of_mask_is_one_entry(monkeypatch, tiny_kitti, tmp_path):
     assert run("masks", *where, "--keep", "left", "--output", tmp_path / "masks") == 0
     mask = cv2.imread(str(tmp_path / "masks/000002.png"), cv2.IMREAD_UNCHANGED)
     assert mask[:, : mask.shape[1] // 2].all() and not mask[:, mask.shape[1] // 2 :].any()
+
+
+def test_a_new_estimator_runs_in_a_study_only_if_it_is_asked_for(monkeypatch):
+    monkeypatch.setitem(ESTIMATORS, "mine", Entry("my estimator", None))
+    parser = build_parser(cli.COMMANDS, ["study"])
+    words = ["study", "--kitti", "kitti", "--labels", "mine", "--output", "out"]
+    assert parser.parse_args(words).estimator == list(COMPARED) == ["thesis", "refined"]
+    assert parser.parse_args([*words, "--estimator", "mine"]).estimator == ["mine"]
 
 
 @pytest.mark.parametrize(

@@ -55,7 +55,6 @@ def separately(sequence, runs):
     "make, runs",
     [
         (odometry.run_many, ["00", "00_masked"]),
-        (odometry.run_many, ["06"]),
         (separately, ["06"]),
         pytest.param(separately, ["00", "00_masked"], marks=pytest.mark.torture),  # 40 seconds
     ],

@@ -185,7 +185,7 @@ def test_failures_of_the_other_estimator_stand_in_the_summary():
     runs = runs_of(ELEVEN, halved)
     failing = (runs["method"] == "masked") & (runs["estimator"] == "thesis")
     runs.loc[failing & (runs["dilation_width"] == 10), "failed"] = 5.0
-    (row,) = comparison.table_summary(compare.comparisons(runs), runs).to_dict("records")
+    (row,) = comparison.table_summary(compare.comparisons(runs)).to_dict("records")
     assert row["estimator"] == "refined estimator"
     assert row["failed runs"] == "0 of 33; thesis's estimator 33 of 33"
     assert row["failed runs of the reference"] == "0 of 33; thesis's estimator 0 of 33"
@@ -251,17 +251,30 @@ def test_a_ratio_near_zero_or_one_has_more_digits(value, text):
 def test_findings_follow_the_verdict(errors, names, verdict, sources):
     runs = runs_of(names, errors, noise=0.02, sources=sources)
     table = compare.comparisons(runs)
+    is_primary = (
+        table["decides"] & (table["method"] == "masked") & (table["reference"] == "baseline")
+    )
+    primary = table[is_primary]
     for source in sources:
-        assert compare.overall(compare.primary_comparison(table, source)["verdict"]) == verdict
+        assert compare.overall(primary.loc[primary["source"] == source, "verdict"]) == verdict
     text = findings.text(runs, table, "KITTI folder embedded, made up", False)
     assert text.count(f"{findings.OUTCOMES[verdict]} here.**") == len(sources)
-    summary = comparison.table_summary(table, runs).set_index("source")
+    summary = comparison.table_summary(table).set_index("source")
     for source in sources:
-        for row in compare.primary_comparison(table, source).to_dict("records"):
+        for row in primary[primary["source"] == source].to_dict("records"):
             assert f"| {texts.ratio(row)} |" in text
             cell = summary.loc[source, compare.METRICS[row["metric"]]]
             assert texts.ratio(row).replace("95 % CI ", "") == cell
         assert summary.loc[source, "verdict"] == verdict
+
+
+@pytest.mark.parametrize("estimators", [["thesis"], ["inliers", "thesis"], ["thesis", "refined"]])
+def test_findings_say_if_the_estimator_that_usually_decides_was_not_run(estimators):
+    runs = runs_of(ELEVEN[:6], halved, estimators=estimators)
+    text = findings.text(runs, compare.comparisons(runs), "made up", False)
+    (first, usual) = (ESTIMATORS[name] for name in (estimators[0], "refined"))
+    said = f"The {usual}, which usually decides, was not run. So the {first} decides"
+    assert (said in text) == ("refined" not in estimators)
 
 
 def drawn_by_cells(runs):

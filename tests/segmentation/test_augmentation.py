@@ -6,7 +6,7 @@ from thesis_repro.errors import InputError
 from thesis_repro.segmentation import augmentation
 
 SIZE = 48
-SEEDS = range(200)
+SEEDS = range(80)
 
 
 @pytest.fixture(scope="module")

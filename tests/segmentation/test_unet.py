@@ -5,6 +5,7 @@ from thesis.diagrams import summary_rows
 from thesis_repro.errors import InputError
 from thesis_repro.segmentation.unet import build_unet
 
+pytestmark = pytest.mark.slow  # they load TensorFlow
 FIGURE = REPORTED["figure_a1_model_summary"]
 
 

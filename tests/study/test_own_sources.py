@@ -14,13 +14,16 @@ from thesis_repro.data.kitti import Sequence
 from thesis_repro.data.trajectories import write_kitti_poses
 from thesis_repro.odometry import metrics
 from thesis_repro.report import study_report as report
-from thesis_repro.study import sources
+from thesis_repro.study import sources, worth
 from thesis_repro.study.plan import Study
+
+pytestmark = pytest.mark.slow
 
 
 @pytest.fixture
-def street(tmp_path):
+def street(tmp_path, monkeypatch):
     """A root with the street of noise as sequences 00 and 01, and one mask for all frames."""
+    monkeypatch.setattr(worth, "MAX_STEPS", 1)  # the worth takes longest, and is tested elsewhere
     street, root = Street(12), tmp_path / "kitti"
     projection = np.column_stack([street.intrinsics, np.zeros(3)]).ravel().tolist()
     for name in ("00", "01"):

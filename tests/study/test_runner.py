@@ -35,7 +35,7 @@ def finished(small_world, small_labels, tmp_path_factory):
     inputs = {"sequences": opened(small_world), "sources": small_labels, "folder": folder}
     summary = runner.run_jobs(jobs, **inputs, processes=2).table
     jobs += section_4_2.reduced_jobs(section_4_2.best_widths(compare.of_method(summary, "masked")))
-    return folder, jobs, runner.run_jobs(jobs, **inputs, processes=2).table
+    return folder, jobs, runner.run_jobs(jobs, **inputs).table
 
 
 def test_a_run_equals_the_odometry_of_its_sequence(small_world, small_labels, finished):

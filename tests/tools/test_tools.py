@@ -11,7 +11,6 @@ import bench
 import evidence
 import moving
 import train_shipped
-from thesis_repro import odometry
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.running.settings import read_settings
@@ -54,7 +53,8 @@ def test_the_training_writes_a_model_and_its_card(camvid_real, tmp_path, monkeyp
     )
 
 
-def test_keypoints_on_movable_things_are_counted(small_world, small_labels, tmp_path):
+def test_keypoints_on_movable_things_are_counted(small_world, small_labels, tmp_path, monkeypatch):
+    monkeypatch.setattr(moving, "cores", lambda: 1)  # workers take longer to start than to run
     table = moving.table(small_world / "kitti", small_labels, tmp_path, repetitions=1, frames=5)
     kinds = table.set_index(["sequence", "keypoints on"])["share (%)"].unstack()
     assert list(kinds.index) == ["00", "01"]
@@ -80,8 +80,12 @@ def test_evidence_keeps_what_shows_no_frame_and_compares_label_maps(
     monkeypatch.setattr(evidence.few_keypoints, "TIMED_RUNS", 1)
     monkeypatch.setattr(evidence.few_keypoints, "NUMBERS", (50, 200))
     evidence.write(settings, out, others)
-    names = {"README", "failures", "label_quality", "streets", "few_keypoints"}
-    names |= {
+    names = {
+        "README",
+        "failures",
+        "label_quality",
+        "streets",
+        "few_keypoints",
         "worth",
         "worth_runs",
         "choices",
@@ -97,7 +101,7 @@ def test_evidence_keeps_what_shows_no_frame_and_compares_label_maps(
     assert {path.stem for path in out.iterdir()} == names
     failures = pd.read_csv(out / "failures.csv")
     assert list(failures["steps"][:2]) == ["00", "01"]
-    assert failures["number"][:2].sum() == failures["number"][2:].sum() == 18
+    assert failures["number"][:2].sum() == failures["number"][2:].sum() == 10
     assert (failures["tracked, masks"] < failures["tracked, all keypoints"]).all()
     assert (failures["agreeing, masks"] <= failures["tracked, masks"]).all()
     quality = pd.read_csv(out / "label_quality.csv")
@@ -105,8 +109,4 @@ def test_evidence_keeps_what_shows_no_frame_and_compares_label_maps(
     rotation = quality[compare.METRICS["rotation"]][:4].str.extract(r"^([\d.]+)")[0].astype(float)
     assert rotation[3] == pytest.approx(rotation[2] / rotation[1], abs=0.02)
     streets = pd.read_csv(out / "streets.csv")
-    assert (streets["frames"] == 10).all() and (streets["metres"] > 0).all()
-    before = {path.name: path.read_bytes() for path in out.iterdir()}
-    monkeypatch.setattr(odometry, "run_many", None)  # would fail
-    evidence.write(settings, out, others)
-    assert {path.name: path.read_bytes() for path in out.iterdir()} == before
+    assert (streets["frames"] == 6).all() and (streets["metres"] > 0).all()

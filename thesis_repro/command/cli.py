@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import redirect_stdout, suppress
 from dataclasses import replace
 from itertools import chain
+from math import isnan
 from pathlib import Path
 from typing import Any
 
@@ -241,21 +242,16 @@ def _record(result: Any, sequence: Any) -> dict[str, Any]:
     """
     from thesis_repro.odometry import metrics
 
-    errors: dict[str, float | None] = dict.fromkeys(ERRORS.values())
-    if sequence.has_truth:
-        for name, value in metrics.errors(result.poses, sequence.poses).items():
-            if value == value:  # not NaN
-                errors[ERRORS[name]] = value
-    mean_keypoints = 0.0
+    errors = metrics.errors(result.poses, sequence.poses) if sequence.has_truth else {}
+    known = {name: value for name, value in errors.items() if not isnan(value)}
     detected = result.frames["detected"].dropna()
-    if len(detected):  # no frame may have structure
-        mean_keypoints = float(detected.mean())
     seconds = result.frames.filter(like="_seconds").sum(axis=1)
     return {
         "sequence": sequence.name,
         "frames": len(sequence),
-        **errors,
-        "mean_keypoints": mean_keypoints,
+        **{name: known.get(error) for error, name in ERRORS.items()},
+        # no frame may have structure
+        "mean_keypoints": float(detected.mean()) if len(detected) else 0.0,
         "ms_per_frame": 1000 * float(seconds.mean()),
         "flagged": {flag: int(count) for flag, count in result.flagged.items()},
     }

@@ -299,7 +299,7 @@ COMMANDS: dict[str, dict[str, dict[str, Any]]] = {
 def named(command: str) -> dict[str, dict[str, Any]]:
     """Return the options whose names stand in tables, which take a second to import."""
     from thesis_repro.masks import BOUNDARIES, KINDS
-    from thesis_repro.odometry.estimators import DETECTORS, ESTIMATORS
+    from thesis_repro.odometry.estimators import COMPARED, DETECTORS, ESTIMATORS
 
     where = ", ".join(kind.help for kind in KINDS.values())
     estimators: dict[str, Any] = dict(
@@ -308,8 +308,8 @@ def named(command: str) -> dict[str, dict[str, Any]]:
         help="motion by a vote of all matched points (PySLAM) or of RANSAC's inliers, or by least squares (thesis)",
     )
     if command == "study":
-        names = [name for name, entry in ESTIMATORS.items() if entry.is_compared]
-        estimators = dict(nargs="+", choices=names, default=names, help="one or several (all)")
+        default = " ".join(COMPARED)
+        estimators |= dict(nargs="+", default=list(COMPARED), help=f"one or several ({default})")
     return {
         "--boundaries": dict(
             metavar="|".join(BOUNDARIES),

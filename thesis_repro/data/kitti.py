@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from copy import copy
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -194,17 +195,6 @@ class Sequence:
         return self._poses
 
     @property
-    def assumed_steps(self) -> np.ndarray:
-        """Step lengths without ground truth, (n,), metres: from the speed, or 1.
-
-        The first one is 0.
-        """
-        steps = np.ones(len(self) - 1)
-        if self.speed is not None:
-            steps = self.speed * np.diff(self.times)
-        return np.concatenate([[0.0], steps])
-
-    @property
     def files(self) -> list[Path]:
         """All files of the sequence.
 
@@ -320,6 +310,20 @@ class Sequence:
         if self.has_truth:
             short._poses = self._poses[:count]
         return short
+
+
+def scales(sequence: Sequence) -> np.ndarray:
+    """Distances between the true positions of consecutive frames, (n,), metres. The first one is 0.
+
+    Without ground truth, they follow from the speed, or are 1.
+    """
+    if sequence.has_truth:
+        steps: Any = [np.linalg.norm(step) for step in np.diff(sequence.poses[:, :3, 3], axis=0)]
+    elif sequence.speed is not None:
+        steps = sequence.speed * np.diff(sequence.times)
+    else:
+        steps = np.ones(len(sequence) - 1)
+    return np.array([0.0, *steps])
 
 
 def check_count(path: Path, count: int, frame_paths: list[Path]) -> None:

@@ -30,8 +30,9 @@ refined.motion_prior):
   otherwise "motion not determined": the previous motion, with this step's length
 """
 
+from thesis_repro.data.kitti import scales
 from thesis_repro.odometry.loop import OPENCV, Calls, Odometry
-from thesis_repro.odometry.runs import Masks, Result, run, run_many, scales, start_pose
+from thesis_repro.odometry.runs import Masks, Result, run, run_many, start_pose
 from thesis_repro.odometry.settings import THESIS, OdometrySettings
 from thesis_repro.odometry.step import Matches, Motion, Step
 

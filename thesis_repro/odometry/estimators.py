@@ -37,12 +37,12 @@ class Entry(NamedTuple):
 
     title: str  # in tables and figures
     make: Callable | None  # as in settings: from the odometry's calls to an estimator
-    is_compared: bool = True  # in studies; otherwise only the ablations run it
 
 
 ESTIMATORS = {
     "thesis": Entry("thesis's estimator", None),
-    "inliers": Entry("vote of the inliers", VoteOfInliers, is_compared=False),
+    "inliers": Entry("vote of the inliers", VoteOfInliers),
     "refined": Entry("refined estimator", refined),
 }
+COMPARED = ("thesis", "refined")  # those of every study that names no others
 DETECTORS: dict[str, Callable | None] = {"shi-tomasi": None, "orb": keypoints.orb}

@@ -27,8 +27,7 @@ def start_pose(start: Any) -> np.ndarray:
     if start is None:
         return np.eye(4)
     pose = np.array(start, np.float64)
-    is_pose = pose.shape == (4, 4) and are_poses(pose[None]).all()
-    if not is_pose or not np.array_equal(pose[3], [0, 0, 0, 1]):
+    if pose.shape != (4, 4) or not are_poses(pose[None]).all():
         raise InputError("start: must be a pose, 4x4: a right-handed rotation and a position")
     return pose
 

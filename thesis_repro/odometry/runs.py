@@ -8,7 +8,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 import pandas as pd
 
-from thesis_repro.data.kitti import Sequence
+from thesis_repro.data.kitti import Sequence, scales
 from thesis_repro.errors import InputError
 from thesis_repro.odometry.inputs import EQUAL
 from thesis_repro.odometry.loop import STATIONARY, Calls, Odometry, detect
@@ -76,17 +76,6 @@ def start_pose(sequence: Sequence) -> np.ndarray:
     if sequence.has_truth and np.abs(sequence.poses[0] - np.eye(4)).max() >= 1e-6:
         return sequence.poses[0]
     return np.eye(4)
-
-
-def scales(sequence: Sequence) -> np.ndarray:
-    """Distances between the true positions of consecutive frames, (n,), metres. The first one is 0.
-
-    Without ground truth, these are the sequence's `assumed_steps`.
-    """
-    if not sequence.has_truth:
-        return sequence.assumed_steps
-    steps = np.diff(sequence.poses[:, :3, 3], axis=0)
-    return np.array([0.0, *map(np.linalg.norm, steps)])
 
 
 def run(

@@ -11,7 +11,7 @@ import numpy as np
 
 import opencv_exact
 from thesis_repro.odometry import corners
-from thesis_repro.odometry.loop import TERMINATION, Calls, Odometry
+from thesis_repro.odometry.loop import TERMINATION, Calls
 from thesis_repro.odometry.settings import THESIS, OdometrySettings
 
 
@@ -45,8 +45,11 @@ class SharedCalls:
         self._tracked: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
         self._matrices: dict[tuple, tuple] = {}
 
-    def expect(self, frame: np.ndarray, runs: Iterable[Odometry]) -> None:
-        """Forget the frame before, and track the points of all runs into this one."""
+    def expect(self, frame: np.ndarray, runs: Iterable[Any]) -> None:
+        """Forget the frame before, and track the points of all runs into this one.
+
+        runs: `Odometry`, or what has `points` in the frame before, `previous`.
+        """
         self._turn_to(frame)
         followed = {run.points.tobytes(): run for run in runs if len(run.points)}
         if not followed:

@@ -36,8 +36,9 @@ def figure_comparison(table: pd.DataFrame) -> Figure:
     is named at the edge, and an arrow marks an interval that is cut. With several sources of masks
     it shows no controls.
     """
-    rows = _shown(table)
+    rows = _drawn(table)
     rows = rows[rows["metric"].isin(compare.JUDGING_METRICS)]
+    sequences = compare.sequences_of(table)
     order = list(rows["label"].unique())
     estimators = [name for name in ESTIMATORS if (rows["estimator"] == name).any()]
     metrics = [name for name in compare.JUDGING_METRICS if (rows["metric"] == name).any()]
@@ -45,7 +46,7 @@ def figure_comparison(table: pd.DataFrame) -> Figure:
     figure, axes = style.new_figure(
         len(estimators), len(metrics), squeeze=False, sharex=True, sharey=True, height=height
     )
-    distances = rows[_sequences(table)].astype(float).map(np.log).abs()
+    distances = rows[sequences].astype(float).map(np.log).abs()
     brought = distances[rows["method"].isin(BROUGHT)].stack()
     wide_enough = [
         reach
@@ -58,7 +59,7 @@ def figure_comparison(table: pd.DataFrame) -> Figure:
         panels[0].set_ylabel(ESTIMATORS[estimator])
         for panel, metric in zip(panels, metrics, strict=True):
             of_panel = rows[(rows["estimator"] == estimator) & (rows["metric"] == metric)]
-            _draw_ratios(panel, of_panel, order, _sequences(table), reach)
+            _draw_ratios(panel, of_panel, order, sequences, reach)
     for panel, metric in zip(axes[0], metrics):
         panel.set_title(compare.METRICS[metric])
     for panel in axes[-1]:
@@ -105,84 +106,51 @@ def _draw_ratios(
     panel.tick_params(labelsize=7)
 
 
-def _over_all_keypoints(table: pd.DataFrame) -> pd.DataFrame:
-    return table[(table["reference"] == "baseline") & (table["method"] != "baseline")]
-
-
-def _shown(table: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows of `compare.comparisons` for figures and tables of errors, with labels."""
-    rows = _tested(_over_all_keypoints(table))
+def _drawn(table: pd.DataFrame) -> pd.DataFrame:
+    """Return the rows of `compare.comparisons` for figures and tables of errors."""
+    rows = table[table["shown"] & (table["reference"] == "baseline")]
+    rows = rows[rows["method"] != "baseline"]
     sources_of_masks = rows.loc[rows["method"] == "masked", "source"]
     if sources_of_masks.nunique() > 1:  # controls of every source would be dozens of rows
         rows = rows[rows["method"].isin(BROUGHT)]
-    return rows.assign(label=label_rows(rows))
+    return rows
 
 
-def _tested(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows of the tested width.
-
-    A source without masks of that width keeps all its rows.
-    """
-    masked = rows[(rows["method"] == "masked") & rows["tested"]]
-    return rows[rows["tested"] | ~rows["source"].isin(masked["source"])]
-
-
-def label_rows(rows: pd.DataFrame) -> pd.Series:
-    """Label each row with its method and the width of its masks.
-
-    If there are several sources, the label begins with the row's source. Own keypoints and paths
-    are labelled with the name of their source.
-    """
-    width = rows["dilation_width"].where(rows["method"] == "masked")
-    width = width.map(", width {:g}".format, na_action="ignore").astype(object).fillna("")
-    labels = rows["method"].map(compare.METHODS) + width
-    if len(compare.sources(rows)) > 1:
-        labels = (rows["source"] + ": " + labels).str.removeprefix(": ")  # all keypoints have none
-    return labels.mask(rows["method"].isin(UNMASKED), rows["source"])
-
-
-def _sequences(table: pd.DataFrame) -> list[str]:
-    """Return the names of the columns with the ratio of each sequence."""
-    return list(table.columns[table.columns.get_loc("failures_verdict") + 1 :])
-
-
-def table_summary(table: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
-    """Return one row for each source: the answer of a study, see `compare.primary_comparison`.
+def table_summary(table: pd.DataFrame) -> pd.DataFrame:
+    """Return one row for each source: the answer of a study, from `compare.comparisons`.
 
     The columns are the mean number of keypoints that the source leaves and that of all, the ratio
     of each judging metric, the verdict, the estimator that these are of, failed runs (those of
     another estimator stand behind its name), and the control that does not use the classes in the
     frame and has the lowest ratio of the first judging metric.
     """
-    estimator = compare.judging_estimator(table)
-    total = compare.of_method(runs, "baseline", estimator)["mean_keypoints"].mean()
-    over_all = _over_all_keypoints(table)
-    is_judged = over_all["tested"] & over_all["metric"].isin(compare.JUDGING_METRICS)
-    brought = over_all[is_judged & over_all["method"].isin(BROUGHT)]
-    others = brought[brought["estimator"] != estimator].drop_duplicates(["source", "estimator"])
-    over_all = over_all[over_all["estimator"] == estimator]
-    judged = brought[brought["estimator"] == estimator]
-    first_metric = next(iter(compare.JUDGING_METRICS))
-    controls = _tested(over_all[over_all["metric"] == first_metric])
-    controls = controls[controls["method"].isin(compare.SEGMENTATION_FREE_CONTROLS)]
+    table = table[table["tested"] & (table["reference"] == "baseline")]
+    total = table.loc[table["decides"] & (table["method"] == "baseline"), "keypoints"].mean()
+    brought = table[table["method"].isin(BROUGHT)]
+    others = brought[brought["metric"].isin(compare.JUDGING_METRICS)]
+    controls = table[table["decides"] & table["method"].isin(compare.SEGMENTATION_FREE_CONTROLS)]
     rows = []
-    for source, pair in judged.groupby("source", sort=False):
+    for source, pair in brought[brought["decides"]].groupby("source", sort=False):
         first = pair.iloc[0]
         row = {
             "source": source,
             "keypoints": f"{first['keypoints']:.0f} instead of {total:.0f}",
-            **{compare.METRICS[line["metric"]]: _short(line) for _, line in pair.iterrows()},
+            **{compare.METRICS[line["metric"]]: texts.short(line) for _, line in pair.iterrows()},
             "verdict": compare.overall(pair["verdict"]),
-            "estimator": ESTIMATORS[estimator],
+            "estimator": ESTIMATORS[first["estimator"]],
         }
-        of_others = others[others["source"] == source]
+        of_source = others[
+            (others["source"] == source) & (others["estimator"] != first["estimator"])
+        ]
+        of_others = of_source.drop_duplicates("estimator")
         for name, column in FAILED.items():
             counts = zip(of_others["estimator"], of_others[column], strict=True)
             named = [f"{ESTIMATORS[other]} {count}" for other, count in counts]
             row[name] = "; ".join([first[column], *named])
         if first["method"] == "paths":
             row["keypoints"] = ""
-        of_source = controls[controls["source"] == source]
+        of_metric = controls[controls["metric"] == first["metric"]]
+        of_source = of_metric[of_metric["source"] == source]
         for _, best in of_source.nsmallest(1, "ratio").iterrows():
             row["best control"] = f"{compare.METHODS[best['method']]} {texts.number(best['ratio'])}"
         rows.append(row)
@@ -198,10 +166,11 @@ def table_comparison(table: pd.DataFrame) -> pd.DataFrame:
     metrics (`compare.overall`), the failed runs of the method and of its reference, and each
     sequence's ratio of the first metric.
     """
-    rows = pd.concat([_tested(_over_all_keypoints(table)), table[table["reference"] != "baseline"]])
+    rows = table[table["shown"] & (table["method"] != "baseline")]
     numbers = rows["keypoints"].round().astype("Int64")  # missing for paths of another system
-    rows = rows.assign(label=label_rows(rows), keypoints=numbers)
-    sequences = _sequences(table)
+    rows = rows.assign(keypoints=numbers, last=rows["reference"] != "baseline")
+    rows = rows.sort_values("last", kind="stable")
+    sequences = compare.sequences_of(table)
     keys = ["estimator", "source", "method", "dilation_width", "reference_source", "reference"]
     lines = []
     for _, pair in rows.groupby(keys, dropna=False, sort=False):
@@ -238,17 +207,13 @@ def _ratios_and_counts(pair: pd.DataFrame) -> dict[str, Any]:
     cells: dict[str, Any] = {}
     for _, row in pair.iterrows():
         name = compare.METRICS[row["metric"]]
-        cells[name] = _short(row)
+        cells[name] = texts.short(row)
         if row["metric"] in compare.JUDGING_METRICS:
             cells[f"{name}: above 1"] = f"{row['above']} of {row['n']}"
             mean = {end: row[f"mean_{end}"] for end in ("low", "high")}
-            cells[f"{name}: geometric mean"] = _short({"ratio": row["mean"], **mean})
+            cells[f"{name}: geometric mean"] = texts.short({"ratio": row["mean"], **mean})
             cells[f"{name}: detectable"] = f"{row['detectable']:.2f}"
     return cells
-
-
-def _short(row: dict[str, Any] | pd.Series) -> str:
-    return texts.ratio(row).replace(f"{compare.LEVEL} % CI ", "")
 
 
 def table_errors(table: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
@@ -258,11 +223,12 @@ def table_errors(table: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
     standard deviation over the repetitions, "0.0103 ± 0.0021", if it is not 0. The lowest mean of a
     sequence is bold, as Markdown has it: "**0.0103 ± 0.0021**".
     """
-    labels = [compare.METHODS["baseline"], *_shown(table)["label"].unique()]
+    labels = [compare.METHODS["baseline"], *_drawn(table)["label"].unique()]
+    runs = runs.assign(label=compare.labels(runs))
     parts = {}
     for metric, estimator in product(compare.JUDGING_METRICS, NEUTRAL_ESTIMATORS):
         rows = runs[runs["estimator"] == estimator].dropna(subset=[metric])
-        errors = rows.groupby([label_rows(rows), "sequence"])[metric]
+        errors = rows.groupby(["label", "sequence"])[metric]
         means = errors.mean().unstack().reindex(labels)
         cells = errors.agg(_mean_and_spread).unstack().reindex(labels)
         cells = cells.mask(means == means.min(), "**" + cells + "**")
@@ -320,7 +286,7 @@ def _widths(masked: pd.DataFrame, baseline: pd.DataFrame) -> pd.DataFrame:
     shown = table.map(texts.number, na_action="ignore").astype(object)
     means, lower = {}, {}
     for name, ratios in table.items():
-        means[name] = _short(compare.typical_ratio(ratios))
+        means[name] = texts.short(compare.typical_ratio(ratios))
         lower[name] = f"{(ratios < 1).sum()} of {ratios.count()}"
     shown.loc["all sequences"] = means
     shown.loc["lower in"] = lower

@@ -15,7 +15,9 @@ OUTCOMES = {
     compare.NO_CLEAR_DIFFERENCE: "no clear difference from all keypoints",
     compare.TOO_FEW: "too few sequences to tell",
 }
+METHODS = (*comparison.BROUGHT, "corrected")
 SHOWN = (*compare.JUDGING_METRICS, "rmse")  # the last one as the thesis measures it
+NOT_RUN = " The {usual}, which usually decides, was not run. So the {judge} decides, the first that was run."
 WORLD = " The embedded world has rendered streets; its results are no evidence about KITTI."
 
 
@@ -26,9 +28,14 @@ def text(runs: pd.DataFrame, table: pd.DataFrame, data: str, embedded: bool, mor
     embedded: whether the frames are those of the embedded world, which is no evidence about KITTI.
     more: Markdown below the first table.
     """
-    rows = _over_all_keypoints(table)
+    judge = compare.judging_estimator(runs)
+    not_run = NOT_RUN.format(usual=ESTIMATORS[compare.USUAL_JUDGE], judge=ESTIMATORS[judge])
+    rows = table[table["tested"] & (table["reference"] == "baseline")]
+    rows = rows[rows["method"].isin(METHODS) & rows["metric"].isin(SHOWN)]
+    rows = rows.sort_values("decides", ascending=False, kind="stable")
     judging = rows[rows["decides"] & (rows["method"] != "corrected")]
-    controls = compare.against(table, compare.SEGMENTATION_FREE_CONTROLS)
+    masked = table[table["decides"] & (table["method"] == "masked")]
+    controls = masked[masked["reference"].isin(compare.SEGMENTATION_FREE_CONTROLS)]
     controls = controls[controls["reference_source"] == controls["source"]]
     verdicts = controls.groupby(["source", "reference"], sort=False)["verdict"].agg(compare.overall)
     sources = []
@@ -46,6 +53,7 @@ def text(runs: pd.DataFrame, table: pd.DataFrame, data: str, embedded: bool, mor
         sources=sources,
         here="in the embedded world" if embedded else "here",
         world=WORLD if embedded else "",
+        not_run="" if judge == compare.USUAL_JUDGE else not_run,
         more=more,
         data=data,
         frames=_frames(runs),
@@ -53,36 +61,21 @@ def text(runs: pd.DataFrame, table: pd.DataFrame, data: str, embedded: bool, mor
         fewest=compare.MIN_SEQUENCES,
         far=compare.FAR_OFF,
         thesis_width=CONTROL_WIDTH,
-        ratios=_markdown(_ratios(rows)),
-        spread=_markdown(_spread(runs)),
-        failures=_markdown(_failures(rows)),
-        controls=_markdown(verdicts.rename(compare.METHODS).unstack("source").reset_index()),
-        pairs=_markdown(_pairs(table)),
-        stability=_markdown(_stability(runs)),
-    )
-
-
-def _markdown(table: pd.DataFrame) -> str:
-    return style.markdown(table) if len(table) else ""
-
-
-def _over_all_keypoints(table: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows of what is compared with all keypoints, with columns label and decides."""
-    methods = (*comparison.BROUGHT, "corrected")
-    rows = table[(table["reference"] == "baseline") & table["tested"]]
-    rows = rows[rows["method"].isin(methods) & rows["metric"].isin(SHOWN)]
-    is_judging = rows["metric"].isin(compare.JUDGING_METRICS)
-    decides = is_judging & (rows["estimator"] == compare.judging_estimator(table))
-    return rows.assign(label=comparison.label_rows(rows), decides=decides).sort_values(
-        "decides", ascending=False, kind="stable"
+        ratios=style.markdown(_ratios(rows)),
+        spread=style.markdown(_spread(runs)),
+        failures=style.markdown(_failures(rows)),
+        controls=style.markdown(verdicts.rename(compare.METHODS).unstack("source").reset_index()),
+        pairs=style.markdown(_pairs(masked[masked["reference"] == "masked"])),
+        stability=style.markdown(_stability(runs)),
     )
 
 
 def _ratios(rows: pd.DataFrame) -> pd.DataFrame:
     """Return the ratios to all keypoints, one row for each source, estimator and error."""
+    sequences = compare.sequences_of(rows)
     lines = []
     for _, row in rows.iterrows():
-        ratios = row.drop([*compare.COLUMNS, *row["far_off"], "label", "decides"]).dropna()
+        ratios = row[sequences].drop(row["far_off"]).dropna()
         without = ""
         if row["far_off"]:
             left_out = ", ".join(row["far_off"])
@@ -118,12 +111,9 @@ def _failures(rows: pd.DataFrame) -> pd.DataFrame:
     )
 
 
-def _pairs(table: pd.DataFrame) -> pd.DataFrame:
+def _pairs(rows: pd.DataFrame) -> pd.DataFrame:
     """Return the ratios of masks of one source to masks of another, each pair once."""
-    both = (table["method"] == "masked") & (table["reference"] == "masked")
-    rows = table[both & (table["source"] < table["reference_source"])]
-    rows = rows[rows["metric"].isin(compare.JUDGING_METRICS)]
-    rows = rows[rows["estimator"] == compare.judging_estimator(table)]
+    rows = rows[rows["source"] < rows["reference_source"]]
     return pd.DataFrame(
         {
             "masks": rows["source"],

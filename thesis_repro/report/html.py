@@ -6,7 +6,7 @@ import platform
 import subprocess
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import mistune
 from markupsafe import Markup
@@ -31,8 +31,10 @@ PACKAGES = (
     "opencv-contrib-python",
     "numpy",
 )
-# what only artefacts of the thesis have
-NOT_OF_THESIS: dict[str, Any] = {"number": None, "makers": [], "thesis": {}, "left_out": None}
+# what only some artefacts have: those of the thesis; a text that the page folds in part; a table,
+# and one that is short enough to be shown
+DEFAULTS: dict[str, Any] = {"number": None, "makers": [], "thesis": {}, "left_out": None}
+DEFAULTS |= {"content": None, "details": None, "rows": 0, "markdown": None}
 
 
 def build_study(folder: Path, names: list[tuple[str, str]], **facts: Any) -> str:
@@ -62,56 +64,36 @@ def build_study(folder: Path, names: list[tuple[str, str]], **facts: Any) -> str
 def describe(folder: Path, artefact: dict[str, Any]) -> dict[str, Any]:
     """Return the values that a template needs to show an artefact, or to report it as missing."""
     kind, name = artefact["kind"], artefact["name"]
-    paths = [folder / f"{name}{ending}" for ending in ENDINGS[kind]]
-    files = [path for path in paths if path.is_file()]
-    content = Content()
+    files = [path for end in ENDINGS[kind] if (path := folder / f"{name}{end}").is_file()]
+    content = {}
     if files and kind == "text":
-        content = text_content(files[0].read_text(encoding="utf-8"))
+        content = _of_text(files[0].read_text(encoding="utf-8"))
     elif files and kind == "table" and files[0].suffix == ".csv":
-        content = _table_content(files)
-    there = bool(files) and (kind == "figure" or content.html is not None)
-    identity = name
-    if kind != "text":
-        identity = f"{kind}-{name}"
+        content = _of_table(files[1].read_text(encoding="utf-8"))
+    there = bool(files) and (kind == "figure" or bool(content))
+    identity = name if kind == "text" else f"{kind}-{name}"
     described = {
         "id": identity,
         "there": there,
-        "content": content.html,
-        "details": content.details,
-        "rows": content.rows,
-        "markdown": content.markdown,
         "files": [path.name for path in files],
         "opens": there and identity in OPENING,
     }
-    return NOT_OF_THESIS | artefact | described
+    return DEFAULTS | artefact | content | described
 
 
-class Content(NamedTuple):
-    """What a page shows of a text or a table."""
-
-    html: Markup | None = None
-    details: Markup | None = None  # of a text: the part that the page folds
-    rows: int = 0  # of a table
-    markdown: str | None = None  # of a table that is short enough to be shown
-
-
-def text_content(text: str) -> Content:
+def _of_text(text: str) -> dict[str, Any]:
     """Return a text in Markdown; the page folds the part after the first heading."""
-    first, _, rest = text.partition("\n## ")
-    if not rest:
-        return Content(from_markdown(first))
-    return Content(from_markdown(first), from_markdown(f"## {rest}"))
+    first, heading, rest = text.partition("\n## ")
+    details = from_markdown(f"## {rest}") if heading else None
+    return {"content": from_markdown(first), "details": details}
 
 
-def _table_content(files: list[Path]) -> Content:
-    """Return a table. files: its CSV file and its Markdown file."""
-    text = files[1].read_text(encoding="utf-8")
-    table = text.partition("\n\n")[0]  # without the data note
+def _of_table(text: str) -> dict[str, Any]:
+    """Return a table in Markdown with its data note."""
+    table, _, _ = text.partition("\n\n")
     rows = table.count("\n") - 1
-    markdown = None
-    if rows <= ROWS_SHOWN:
-        markdown = text
-    return Content(from_markdown(table), rows=rows, markdown=markdown)
+    markdown = text if rows <= ROWS_SHOWN else None
+    return {"content": from_markdown(table), "rows": rows, "markdown": markdown}
 
 
 class _Renderer(mistune.HTMLRenderer):

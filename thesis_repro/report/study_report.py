@@ -46,11 +46,8 @@ def write(
     Returns the page's path. warnings: lines for the top of the html. worths: of `Study.worths`.
     """
     # `thesis-repro synthesize` leaves a record beside the KITTI folder of an embedded world
-    world = provenance.record(study.kitti.resolve().parent) or {}
-    embedded = "train_images" in world
-    data = f"KITTI folder {study.kitti.name}"
-    if embedded:
-        data = "embedded world (rendered)"
+    embedded = "train_images" in (provenance.record(study.kitti.resolve().parent) or {})
+    data = "embedded world (rendered)" if embedded else f"KITTI folder {study.kitti.name}"
     changed = {source.name: _changed(source) for source in study.sources}
     masks = [
         f"{source.name} ({KINDS[source.kind]}{changed[source.name]})" for source in study.sources
@@ -72,7 +69,7 @@ def write(
     for name, figure in figures.items():
         style.write_figure(figure, folder / f"{name}.pdf")
     numbers = {
-        "summary": pd.concat([comparison.table_summary(table, runs), _failed(study, runs)]),
+        "summary": pd.concat([comparison.table_summary(table), _failed(study, runs)]),
         "comparison": comparison.table_comparison(table),
         "widths": comparison.table_widths(runs),
         "errors": comparison.table_errors(table, runs),
@@ -80,12 +77,12 @@ def write(
     if worths is not None:
         numbers["worth"] = worth.table(worths)
         provenance.write_table(folder / "worth_runs.csv", worths)
-    for name, rows in numbers.items():
-        text = latex(rows)
-        if name == "errors":
-            text = latex_errors(rows, study.repetitions)
-        if name == "summary" and len(rows):  # one column a source fits into a column of text
-            text = latex(rows.set_index("source").T.rename_axis("source").reset_index())
+    in_latex = {name: latex(rows) for name, rows in numbers.items()}
+    in_latex["errors"] = latex_errors(numbers["errors"], study.repetitions)
+    if len(numbers["summary"]):  # one column a source fits into a column of text
+        by_source = numbers["summary"].set_index("source").T.rename_axis("source")
+        in_latex["summary"] = latex(by_source.reset_index())
+    for name, text in in_latex.items():
         write_text(folder / f"{name}.tex", f"% {note}\n{text}")
     numbers["runs"] = runs.round(6)  # hundreds of pages in LaTeX
     names = style.save_all(figures, numbers, folder, note)

@@ -296,10 +296,12 @@ def save_all(
 
 
 def markdown(table: pd.DataFrame) -> str:
-    """Return a pandas table as Markdown.
+    """Return a pandas table as Markdown, an empty one as "".
 
     Numbers are aligned to the right, and missing values are empty. Names are no HTML.
     """
+    if table.empty:
+        return ""
     numeric = [pd.api.types.is_numeric_dtype(table[column]) for column in table]
     rows = [list(map(_cell, table.columns)), ["---:" if right else ":---" for right in numeric]]
     rows += [list(map(_cell, row)) for row in table.itertuples(index=False)]

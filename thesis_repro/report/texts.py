@@ -45,27 +45,20 @@ def number(value: float) -> str:
     return f"{value:.{digits}f}"
 
 
-def ratio(row: dict[str, Any] | pd.Series) -> str:
-    """Return "1.09 (95 % CI 0.98-1.32)" for a row with ratio, low and high.
+def short(row: dict[str, Any] | pd.Series) -> str:
+    """Return "1.09 (0.98-1.32)" for a row with ratio, low and high.
 
     Without an interval (low is missing) it is only the ratio.
     """
     mean = number(row["ratio"])
     if pd.isna(row["low"]):
         return mean
-    low, high = number(row["low"]), number(row["high"])
-    return f"{mean} ({compare.LEVEL} % CI {low}-{high})"
+    return f"{mean} ({number(row['low'])}-{number(row['high'])})"
 
 
-def ratio_and_far_off(row: dict[str, Any] | pd.Series) -> str:
-    """Return `ratio` and the sequences far from the others.
-
-    Such as "3.85 (95 % CI 0.71-80.41), sequence 01 alone 95.20".
-    """
-    text = ratio(row)
-    for name in row["far_off"]:
-        text += f", sequence {in_markdown(name)} alone {number(row[name])}"
-    return text
+def ratio(row: dict[str, Any] | pd.Series) -> str:
+    """Return `short` with what the interval is: "1.09 (95 % CI 0.98-1.32)"."""
+    return short(row).replace("(", f"({compare.LEVEL} % CI ")
 
 
 def in_markdown(text: object) -> str:
@@ -87,6 +80,4 @@ TEMPLATES.filters |= {
     "in_shell": shlex.quote,
     "one_line": one_line,
     "urlencode": in_url,
-    "ratio": ratio_and_far_off,
-    "number": number,
 }

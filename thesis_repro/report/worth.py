@@ -37,11 +37,10 @@ def table(worths: pd.DataFrame) -> pd.DataFrame:
 
 def cell(row: dict, name: str) -> str:
     """Return a typical worth of `worth.typical` as text."""
-    text = texts.number(row[name])
-    if not np.isnan(row[f"{name}_low"]):
-        low, high = texts.number(row[f"{name}_low"]), texts.number(row[f"{name}_high"])
-        text = f"{text} ({low}-{high})"
-    return f"{text}, {row[f'{name}_below']} of {row['n']} below 1"
+    ends = {end: row[f"{name}_{end}"] for end in ("low", "high")}
+    return (
+        f"{texts.short({'ratio': row[name], **ends})}, {row[f'{name}_below']} of {row['n']} below 1"
+    )
 
 
 def figure(worths: pd.DataFrame, number: int = DECIDING) -> Figure:

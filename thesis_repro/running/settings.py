@@ -66,7 +66,7 @@ PROFILES = {
         epochs=2,
         patience=5,
         training_images=16,
-        frames=10,
+        frames=6,
         timed_frames=3,
         widths=(5, 10),
         repetitions=2,
@@ -100,12 +100,12 @@ PROFILES = {
         epochs=16,
         patience=5,
         training_images=200,
-        frames=40,
+        frames=30,
         timed_frames=5,
         # the thesis has all 15; these show the same curve in less time
         widths=(1, 3, 5, 7, 10, 13, 15),
         repetitions=2,
-        world=_world(11, 40, 100, 20),
+        world=_world(11, 30, 100, 20),
     ),
     "thesis": Profile(
         image_size=320,

@@ -18,8 +18,8 @@ A ratio is formed in three steps:
    ratio could be off if other sequences of the same kind had been recorded.
 
 The verdict is "lower" or "higher" if the interval excludes 1, and otherwise "no clear difference".
-With fewer than MIN_SEQUENCES sequences it is "too few sequences to tell". `primary_comparison`
-selects the rows that answer the main question.
+With fewer than MIN_SEQUENCES sequences it is "too few sequences to tell". The rows that answer the
+main question are those that `decide`.
 
 How often a method fails is a question of its own, which the ratio does not answer. A run has
 failed if one of its steps has, or if it is lost (`metrics.step_errors`). `failures` counts such
@@ -46,9 +46,9 @@ from thesis_repro.study import methods
 from thesis_repro.study.errors import ERRORS
 from thesis_repro.study.jobs import CONTROL_WIDTH, ESTIMATORS
 from thesis_repro.study.methods import MASK_CONTROLS
+from thesis_repro.study.sources import UNMASKED
 
-# {name: title} of the methods and errors that are compared. The judging metrics decide (see
-# `primary_comparison`).
+# {name: title} of the methods and errors that are compared. The judging metrics decide.
 METHODS = {
     name: method.title
     for name, method in methods.METHODS.items()
@@ -70,7 +70,10 @@ COLUMNS = (
     "reference",
     "metric",
     "estimator",
+    "label",
     "tested",
+    "shown",
+    "decides",
     "ratio",
     "low",
     "high",
@@ -89,6 +92,7 @@ COLUMNS = (
     "failures_verdict",
 )
 
+USUAL_JUDGE = "refined"  # the estimator that decides, since shuffling changes it least
 MIN_FOR_INTERVAL = 3  # values of a mean
 # With fewer sequences, all ratios lie on the same side of 1 by chance in more than 5 % of cases (2
 # / 2**n).
@@ -213,11 +217,17 @@ def comparisons(runs: pd.DataFrame) -> pd.DataFrame:
 
     Masks are compared with every control. Returns a table with the columns source, method,
     dilation_width (pixels), keypoints (mean number); reference_source, reference (the method
-    compared with); metric, estimator; tested (whether the width is the `tested_width`); those of
+    compared with); metric, estimator; label (see `labels`); tested (whether the width is the
+    `tested_width`); shown (whether it is that, or the source has no masks of that width); decides
+    (whether the row is of the tested width, a judging metric and the `judging_estimator`); those of
     `typical_ratio`; far_off (see `far_off`); those of `failures`; and one column for each sequence
     with its ratio.
+    Masks help if both rows that decide are LOWER than with all keypoints. The segmentation helps if
+    they are also LOWER than with each of SEGMENTATION_FREE_CONTROLS.
     An error that no sequence has with both methods has no row.
     """
+    runs = runs.assign(label=labels(runs))
+    judging = judging_estimator(runs)
     metrics = [name for name in METRICS if name in runs and runs[name].notna().any()]
     rows = []
     for estimator in ESTIMATORS:
@@ -235,13 +245,24 @@ def comparisons(runs: pd.DataFrame) -> pd.DataFrame:
                     "reference": reference["method"],
                     "estimator": estimator,
                     "metric": metric,
+                    "decides": variant["tested"]
+                    and metric in JUDGING_METRICS
+                    and estimator == judging,
                     "far_off": far_off(by_sequence),
                     **typical_ratio(by_sequence),
                     **failures(errors["failed"], reference_errors["failed"]),
                     **by_sequence,
                 }
                 rows.append(row)
-    return pd.DataFrame(rows, columns=[*COLUMNS, *sorted(runs["sequence"].unique())])
+    table = pd.DataFrame(rows, columns=[*COLUMNS, *sorted(runs["sequence"].unique())])
+    masked = table[table["tested"].astype(bool) & (table["method"] == "masked")]
+    table["shown"] = table["tested"] | ~table["source"].isin(masked["source"])
+    return table
+
+
+def sequences_of(table: pd.DataFrame) -> list[str]:
+    """Return the names of the columns of `comparisons` with the ratio of each sequence."""
+    return list(table.columns[len(COLUMNS) :])
 
 
 def has_failed(runs: pd.DataFrame) -> pd.Series:
@@ -300,6 +321,7 @@ def _variants(
                 "method": method,
                 "dilation_width": width,
                 "keypoints": rows.groupby("sequence")["mean_keypoints"].mean().mean(),
+                "label": rows["label"].iloc[0],
                 "tested": bool(tested),
             }
             errors = {metric: _mean_logarithms(rows, metric) for metric in metrics}
@@ -319,32 +341,6 @@ def _is_compared(variant: dict[str, Any], reference: dict[str, Any]) -> bool:
     return variant["source"] == reference["source"] or reference["method"] == "masked"
 
 
-def primary_comparison(table: pd.DataFrame, source: str | None = None) -> pd.DataFrame:
-    """Return the rows of `comparisons` that answer whether masks from a segmentation help.
-
-    They compare masks of the tested width with all keypoints by JUDGING_METRICS, under the
-    `judging_estimator`. Masks help if both verdicts are LOWER. The segmentation helps if masks are
-    also LOWER than each of SEGMENTATION_FREE_CONTROLS (see `against`). source: only this source of
-    masks; by default all of them.
-    """
-    return against(table[table["tested"]], ["baseline"], source)
-
-
-def against(
-    table: pd.DataFrame, references: Iterable[str], source: str | None = None
-) -> pd.DataFrame:
-    """Return the rows of `comparisons` for masks against the given methods.
-
-    They are chosen as in `primary_comparison`.
-    """
-    masked = table[table["method"] == "masked"]
-    rows = masked[masked["reference"].isin(list(references))]
-    rows = rows[rows["metric"].isin(JUDGING_METRICS)]
-    if source is not None:
-        rows = rows[rows["source"] == source]
-    return rows[rows["estimator"] == judging_estimator(rows)]
-
-
 def overall(verdicts: Iterable[str]) -> str:
     """Return the verdict of several metrics together.
 
@@ -359,14 +355,13 @@ def overall(verdicts: Iterable[str]) -> str:
     return distinct.pop()
 
 
-def judging_estimator(table: pd.DataFrame) -> str:
+def judging_estimator(runs: pd.DataFrame) -> str:
     """Return the estimator that decides.
 
-    It is the refined one if it has errors, since shuffling changes them least, and otherwise the
-    first that was run.
+    It is the USUAL_JUDGE if it was run, and otherwise the first that was.
     """
-    estimators = [*table["estimator"], "thesis"]
-    return "refined" if "refined" in estimators else estimators[0]
+    estimators = list(runs["estimator"])
+    return USUAL_JUDGE if USUAL_JUDGE in estimators else estimators[0]
 
 
 def shuffle_spread(runs: pd.DataFrame) -> pd.DataFrame:
@@ -378,6 +373,20 @@ def shuffle_spread(runs: pd.DataFrame) -> pd.DataFrame:
     baseline = runs[runs["method"] == "baseline"]
     table = spread(baseline, "rmse", by=["estimator", "sequence"]).reset_index()
     return table.assign(factor=table["highest"] / table["lowest"])
+
+
+def labels(runs: pd.DataFrame) -> pd.Series:
+    """Label each run with its method and the width of its masks.
+
+    If there are several sources, the label begins with the run's source. Own keypoints and paths
+    are labelled with the name of their source.
+    """
+    width = runs["dilation_width"].where(runs["method"] == "masked")
+    width = width.map(", width {:g}".format, na_action="ignore").astype(object).fillna("")
+    label = runs["method"].map(METHODS) + width
+    if len(sources(runs)) > 1:
+        label = (runs["source"] + ": " + label).str.removeprefix(": ")  # all keypoints have none
+    return label.mask(runs["method"].isin(UNMASKED), runs["source"])
 
 
 # Parts of a table of runs

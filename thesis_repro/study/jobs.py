@@ -12,20 +12,16 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from thesis_repro.data.kitti import Sequence
+from thesis_repro.data.kitti import TRUE_LABELS, Sequence
 from thesis_repro.odometry import OdometrySettings, estimators
-from thesis_repro.study.methods import MASK_CONTROLS, OF_LABEL_MAPS, true_labels
+from thesis_repro.study.methods import MASK_CONTROLS, OF_LABEL_MAPS
 from thesis_repro.study.sources import UNMASKED, Source
 
 # Pixels: the dilation width of Section 3.6 and Figures 3.6 and 4.5, at which masks are tested. It
 # was fixed before any run. (The code of appendix A.8 dilates by 5, audit row 26.)
 CONTROL_WIDTH = 10
-# {name: title} of the estimators that studies compare; shuffled points change the second far less
-ESTIMATORS = {
-    name: estimator.title
-    for name, estimator in estimators.ESTIMATORS.items()
-    if estimator.is_compared
-}
+# {name: title}
+ESTIMATORS = {name: estimator.title for name, estimator in estimators.ESTIMATORS.items()}
 # Passes for each of several workers. Every pass decodes and tracks anew: a sequence on two workers
 # takes 13 % more CPU time than in one pass, and with 4 pieces 35 %.
 PIECES = 2
@@ -106,48 +102,41 @@ def first_jobs(
         all_widths.add(tested)
     jobs: list[Job] = []
     for sequence in sequences:
-        jobs += repeated([Job(sequence.name, "baseline")], widths, repetitions)
+        jobs.append(Job(sequence.name, "baseline"))
         for source in sources:
             if source.kind in UNMASKED:
-                times = repetitions
-                if source.kind == "paths":
-                    times = 1  # a path has nothing to shuffle
-                job = Job(sequence.name, source.kind, source=source.name)
-                jobs += repeated([job], widths, times)
+                jobs.append(Job(sequence.name, source.kind, source=source.name))
                 continue
-            widths_of_source: list[Any] = [None]  # of masks without a width
-            if source.has_width:
-                widths_of_source = sorted(all_widths)
-            for width in widths_of_source:
-                job = Job(sequence.name, "masked", width, source=source.name)
-                estimators_of_width = [
-                    estimator
-                    for estimator, requested in widths.items()
-                    if width in (None, tested) or width in requested
-                ]
-                jobs += repeated([job], estimators_of_width, repetitions)
+            masks = Job(sequence.name, "masked", source=source.name)
+            of_source = sorted(all_widths) if source.has_width else [None]
+            jobs += [replace(masks, dilation_width=width) for width in of_source]
             if tested:
-                jobs += repeated(_control_jobs(sequence, source, tested), widths, repetitions)
-    return jobs
-
-
-def _control_jobs(sequence: Sequence, source: Source, tested: int) -> list[Job]:
-    """Return the controls that are masks, as far as a source and a sequence allow them."""
-    width = tested if source.has_width else None
-    widths: dict[str, int | None] = dict.fromkeys(MASK_CONTROLS, width)
-    widths |= dict.fromkeys(OF_LABEL_MAPS, tested)
+                controls = mask_controls(source, sequence, tested).items()
+                jobs += [
+                    replace(masks, method=name, dilation_width=width) for name, width in controls
+                ]
     return [
-        Job(sequence.name, method, width, source=source.name)
-        for method, width in widths.items()
-        if is_possible(method, source, sequence)
+        job
+        for job in repeated(jobs, widths, repetitions)
+        # a path has nothing to shuffle
+        if (job.method != "paths" or job.repetition == 0)
+        and (job.method != "masked" or job.dilation_width in (None, tested, *widths[job.estimator]))
     ]
 
 
-def is_possible(method: str, source: Source, sequence: Sequence) -> bool:
-    """Return whether a source and a sequence have what a method with masks needs."""
-    if method == "true-labels" and not true_labels(sequence.root, sequence.name).is_dir():
-        return False
-    return source.has_label_maps or method not in OF_LABEL_MAPS
+def mask_controls(source: Source, sequence: Sequence, width: int | None) -> dict[str, int | None]:
+    """Return {method: its width} of the controls that are masks, which a source allows.
+
+    width: pixels, of masks from label maps.
+    """
+    allowed = {
+        method: width if source.has_width or method in OF_LABEL_MAPS else None
+        for method in MASK_CONTROLS
+        if source.has_label_maps or method not in OF_LABEL_MAPS
+    }
+    if not (sequence.folder / TRUE_LABELS).is_dir():
+        allowed.pop("true-labels", None)
+    return allowed
 
 
 def repeated(jobs: Iterable[Job], estimators: Iterable[str], repetitions: int) -> list[Job]:

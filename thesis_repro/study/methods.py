@@ -8,7 +8,6 @@ function and an entry in METHODS, a new error of a path one in study/errors.py.
 
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
 from thesis_repro.data.kitti import TRUE_LABELS, Sequence
@@ -21,14 +20,6 @@ from thesis_repro.study.sources import Source
 # boundary within about 2 pixels of the frame, and within 10 pixels of its border the Lucas-Kanade
 # window of 21 pixels is cut off.
 CORRECTED = MaskSettings("exact", symmetric=True, movable=2, margin=10)
-
-
-def true_labels(kitti: Path, name: str) -> Path:
-    """Return the folder of a sequence's true label maps.
-
-    Only sequences of the embedded world have one. kitti: the root of the sequences.
-    """
-    return Path(kitti) / "sequences" / name / TRUE_LABELS
 
 
 # The methods: functions of a sequence, a source and a width of its masks in pixels
@@ -72,9 +63,9 @@ def made_with(settings: MaskSettings | None = None, **changes: Any) -> Callable[
 
 def from_true_labels(sequence: Sequence, source: Source, width: int | None) -> Choice:
     """Run with masks from the true label maps."""
-    folder = true_labels(sequence.root, sequence.name)
     settings = replace(source.settings, ids="labels")
-    return masked(sequence, replace(source, folder=folder, settings=settings), width)
+    true = replace(source, folder=sequence.folder / TRUE_LABELS, settings=settings)
+    return masked(sequence, true, width)
 
 
 class Method(NamedTuple):

@@ -19,18 +19,19 @@ import numpy as np
 import pandas as pd
 
 from thesis_repro import odometry
-from thesis_repro.data.kitti import Sequence
-from thesis_repro.errors import InputError
+from thesis_repro.data.kitti import TRUE_LABELS, Sequence
+from thesis_repro.errors import InputError, cause
 from thesis_repro.mask_files import LabelMasks, MaskFolder
 from thesis_repro.odometry import THESIS, OdometrySettings
+from thesis_repro.odometry.estimators import COMPARED
 from thesis_repro.odometry.runs import is_flagged, poses_of
 from thesis_repro.running import program, provenance
 from thesis_repro.running.files import listed, progress, write_text
 from thesis_repro.study import compare
 from thesis_repro.study.controls import OtherFrame, min_distance
 from thesis_repro.study.errors import path_errors
-from thesis_repro.study.jobs import ESTIMATORS, Job, in_passes, repeated
-from thesis_repro.study.methods import METHODS, true_labels
+from thesis_repro.study.jobs import Job, in_passes, repeated
+from thesis_repro.study.methods import METHODS
 from thesis_repro.study.sources import UNMASKED, Source, by_name
 from thesis_repro.study.workers import open_pool
 
@@ -102,20 +103,30 @@ def run_all(
     lost.
     """
     sequences = {sequence.name: sequence for sequence, _, _ in runs.values()}
+    total, reasons = len(runs) + len(failed), dict(failed)
     with provenance.claimed(folder):
         for sequence in sequences.values():
             _stage(folder, sequence, made_from)
             _drop_changed(runs, folder / sequence.name)
         waiting = {job: run for job, run in runs.items() if not _file(folder, job).is_file()}
-        reasons = {**failed, **_run_passes(waiting, sequences, folder, processes, scheduler)}
+        with open_pool(processes, scheduler) as pool:
+            calls = []
+            for jobs in in_passes(waiting, sequences, pool.size):
+                sequence = sequences[jobs[0].sequence]
+                record = provenance.record(folder / sequence.name)
+                calls.append(({job: waiting[job][1:] for job in jobs}, sequence, folder, record))
+            frames = [len(pass_runs) * len(sequence) for pass_runs, sequence, *_ in calls]
+            with progress(None, "odometry", total=sum(frames), unit="frame") as bar:
+                for count, of_pass in zip(frames, pool.run(_run_pass, calls), strict=True):
+                    reasons |= of_pass
+                    bar.update(count)
     warnings = _report(reasons)
     rows = []
     for job, (sequence, _, _) in runs.items():
         path = _file(folder, job)
         if path.is_file():
-            numbers = _measures_of_file(path, path.stat().st_mtime_ns, sequence)
+            numbers = _measures(path, path.stat().st_mtime_ns, sequence)
             rows.append({"sequence": job.sequence, "run": job.name, **asdict(job), **numbers})
-    total = len(runs) + len(failed)
     if not rows:
         first = next(iter(reasons.values()))
         raise InputError(f"all {total} odometry runs failed; the first: {first}")
@@ -145,11 +156,12 @@ def run_jobs(
     opened = {sequence.name: sequence for sequence in sequences if sequence.name in names}
     made_from: dict[str, dict[str, Any]] = {}
     for name, sequence in opened.items():
-        true_maps = listed(true_labels(sequence.root, name))
+        true_maps = listed(sequence.folder / TRUE_LABELS)
         made_from[name] = {"true_labels": provenance.digest_of_files(true_maps)}
         for source in sources_by_name.values():
             place = f"{name}/{source.name}" if source.name else name
             made_from.setdefault(place, {}).update(source.record(name))
+
     runs, failed = chosen(jobs, opened, sources_by_name)
     for job, (sequence, settings, masks) in runs.items():
         settings = replace(settings, scale_gate=scale_gate)
@@ -189,12 +201,20 @@ def chosen(
 
 
 @cache  # a study calls `run_jobs` again, with more jobs
-def _measures_of_file(path: Path, changed: int, sequence: Sequence) -> dict[str, Any]:
-    """Return the `measures` of a result file. changed: when the file was changed, ns."""
+def _measures(path: Path, changed: int, sequence: Sequence) -> dict[str, Any]:
+    """Return what a table of runs has from the file of a run: errors, keypoints, flagged frames.
+
+    changed: when the file was changed, ns. The errors are `path_errors`.
+    """
     # an empty flag stays a text, an empty number becomes NaN
     numbers = {"detected": "", "tracked": ""}
     frames = pd.read_csv(path, keep_default_na=False, na_values=numbers)
-    return measures(frames, sequence.poses)
+    return {
+        "frames": len(frames),
+        **path_errors(poses_of(frames), sequence.poses),
+        "mean_keypoints": frames["detected"].mean(),
+        "flagged": int(is_flagged(frames).sum()),
+    }
 
 
 def keypoint_controls(
@@ -203,7 +223,7 @@ def keypoint_controls(
     sources: Iterable[Source],
     repetitions: int,
     width: int,
-    estimators: Iterable[str] = tuple(ESTIMATORS),
+    estimators: Iterable[str] = COMPARED,
 ) -> list[Job]:
     """Return jobs without a mask that keep as many keypoints as the masks of each source leave.
 
@@ -225,33 +245,6 @@ def keypoint_controls(
             spread = replace(job, method="spread", min_distance=min_distance(sequence, number))
             jobs += repeated([fewer, spread], estimators, repetitions)
     return jobs
-
-
-def _run_passes(
-    runs: dict[Job, Run],
-    sequences: dict[str, Sequence],
-    folder: Path,
-    processes: int,
-    scheduler: str | None,
-) -> dict[Job, str]:
-    """Make runs; returns which of them failed, and why."""
-
-    def frames(pass_jobs: Iterable[Job]) -> int:
-        return sum(len(sequences[job.sequence]) for job in pass_jobs)
-
-    reasons: dict[Job, str] = {}
-    with open_pool(processes, scheduler) as pool:
-        calls = []
-        for pass_jobs in in_passes(runs, sequences, pool.size):
-            sequence = sequences[pass_jobs[0].sequence]
-            record = provenance.record(folder / sequence.name)
-            pass_runs = {job: runs[job][1:] for job in pass_jobs}
-            calls.append((pass_runs, sequence, folder, record))
-        with progress(None, "odometry", total=frames(runs), unit="frame") as bar:
-            for pass_jobs, pass_reasons in pool.run(_run_pass, calls):
-                reasons |= pass_reasons
-                bar.update(frames(pass_jobs))
-    return reasons
 
 
 def _report(reasons: Mapping[Job, str]) -> list[str]:
@@ -326,12 +319,12 @@ def _versions() -> dict[str, Any]:
 
 def _run_pass(
     runs: dict[Job, tuple[OdometrySettings, Any]], sequence: Sequence, folder: Path, record: dict
-) -> tuple[list[Job], dict[Job, str]]:
+) -> dict[Job, str]:
     """Make runs over one sequence in one pass, here or on another machine.
 
     Every file of masks is read first, because a bad file in the middle would stop the whole pass.
-    record: of the sequence's results, as the main process sees it. Returns the jobs, and the
-    reasons of those that failed.
+    record: of the sequence's results, as the main process sees it. Returns the reasons of the jobs
+    that failed.
     """
     reasons: dict[Job, str] = {}
     threads = cv2.getNumThreads()
@@ -360,27 +353,11 @@ def _run_pass(
             else:
                 write_text(_file(folder, job), result.frames.to_csv(index=False))
     except Exception as error:  # report any error as the reason, and let other passes run
-        reason = str(error)
-        if not isinstance(error, InputError):
-            reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
         unfinished = [job for job in runs if not _file(folder, job).is_file()]
-        reasons = dict.fromkeys(unfinished, reason) | reasons
+        reasons = dict.fromkeys(unfinished, cause(error)) | reasons
     finally:
         cv2.setNumThreads(threads)
-    return list(runs), reasons
-
-
-def measures(frames: pd.DataFrame, true: np.ndarray) -> dict[str, Any]:
-    """Return what a table of runs has from a run's frames: errors, keypoints, flagged frames.
-
-    frames: the table of `odometry.Result`. true: poses (n, 4, 4). The errors are `path_errors`.
-    """
-    return {
-        "frames": len(frames),
-        **path_errors(poses_of(frames), true),
-        "mean_keypoints": frames["detected"].mean(),
-        "flagged": int(is_flagged(frames).sum()),
-    }
+    return reasons
 
 
 def run_poses(runs: pd.DataFrame, folder: Path) -> dict[tuple[str, str], np.ndarray]:

@@ -15,7 +15,7 @@ from thesis_repro import odometry
 from thesis_repro.data import label_ids
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.data.trajectories import have_times, read_poses, read_poses_at
-from thesis_repro.errors import InputError
+from thesis_repro.errors import InputError, cause
 from thesis_repro.mask_files import LabelMasks, MaskFolder, folder_of_sequence, read_mask
 from thesis_repro.masks import MaskSettings
 from thesis_repro.running import provenance
@@ -69,13 +69,6 @@ class Source:
             return MaskFolder(self.folder, sequence, self.invert)
         width = dilation_width if self.has_width else None
         return LabelMasks(self.folder, sequence, width, self.settings)
-
-    def check_file(self, path: Path, size: tuple[int, int]) -> None:
-        """Raise InputError if a file is not a label map, or not a mask of size (height, width)."""
-        if self.has_label_maps:
-            label_ids.read(path, self.settings.ids)
-        else:
-            read_mask(path, size)
 
     def file(self, sequence: str) -> Path:
         """Return the file of the keypoints, or of the path of a sequence."""
@@ -187,9 +180,7 @@ def _try(path: Path, sequence: Sequence) -> None:
     except (InputError, OSError):
         raise
     except Exception as error:
-        raise InputError(
-            f"{path}: {type(error).__name__}: {' '.join(str(error).split())}"
-        ) from error
+        raise InputError(f"{path}: {cause(error)}") from error
 
 
 def own_path(path: Path, sequence: Sequence) -> np.ndarray:
@@ -283,4 +274,7 @@ def check(
             # raises InputError for a width that is too large for the frames
             for width in widths or (1,):
                 paths = source.masks(sequence, width).paths
-            source.check_file(paths[0], sequence.size)
+            if source.has_label_maps:
+                label_ids.read(paths[0], source.settings.ids)
+            else:
+                read_mask(paths[0], sequence.size)

@@ -51,8 +51,10 @@ keypoints there are, the more of what they tell they share.
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
+from functools import cache, partial
 from itertools import product
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -60,7 +62,7 @@ import pandas as pd
 
 import opencv_exact
 from thesis_repro.data.kitti import Sequence
-from thesis_repro.errors import InputError
+from thesis_repro.errors import InputError, cause
 from thesis_repro.odometry import (
     THESIS,
     Calls,
@@ -78,14 +80,15 @@ from thesis_repro.odometry.runs import check, inside
 from thesis_repro.odometry.sharing import SharedCalls
 from thesis_repro.running import provenance
 from thesis_repro.running.files import progress
-from thesis_repro.study import compare, jobs, methods
+from thesis_repro.study import compare, jobs
+from thesis_repro.study.methods import METHODS
 from thesis_repro.study.runner import CODE
 from thesis_repro.study.sources import UNMASKED, Source, own_calls
 from thesis_repro.study.workers import open_pool
 
 NUMBERS = (100, 200, 400)
 DECIDING = 400  # keypoints
-SPLITS = 3  # of each kind
+SPLITS, SEED = 3, 0  # splits of each kind
 FIELD = 2 * THESIS.window  # side of a field, pixels
 MAX_STEPS = 200  # of a sequence, at equal distances; no street of the tables has more
 MIN_RANDOM = 20  # random keypoints with which even a choice of fewer is compared
@@ -113,16 +116,13 @@ class Tracks(NamedTuple):
 def worth(
     sequence: Sequence,
     choices: Choices,
-    splits: int = SPLITS,
-    seed: int = 0,
     calls: Mapping[str, Calls] = {},
-    description: str | None = None,
 ) -> pd.DataFrame:
     """Return what a keypoint of each choice is worth on a sequence, by the rule above.
 
     choices: {(name, number): (settings, masks)}, as for `odometry.run_many`; so many keypoints are
     drawn from those that the settings and the masks leave, 0 for all of them. calls: of choices
-    with own keypoints, by name. description: text of the progress bar; None for no bar.
+    with own keypoints, by name.
 
     One row a choice, number and split ("fields" or "points"): sequence, choice, number, split,
     steps; keypoints, the median number; rotation and direction, the worths; rotation_deg and
@@ -140,26 +140,23 @@ def worth(
     spaced = np.linspace(0, len(steps) - 1, min(len(steps), MAX_STEPS))
     steps = steps[spaced.round().astype(int)]
     shared = SharedCalls()
-    rows: list[dict] = []
-    for index in progress(steps, description):
+    rows = []
+    for index in progress(steps, f"worth of keypoints, {sequence.name}"):
         random, chosen = tracked(sequence, int(index), choices, shared, calls)
-        references: dict[tuple, dict] = {}  # of random keypoints
+        halves_of_random = cache(partial(_halves, random))
         for (name, number), tracks in chosen.items():
             count = min(number or len(tracks.points), len(tracks.points))
-            for split, repeat in product(SPLIT, range(splits)):
-                key = (max(count, MIN_RANDOM), split, (seed, index, repeat, 1))
-                if key not in references:
-                    halves = _halves(random, *key)
-                    references[key] = {f"random_{name}": value for name, value in halves.items()}
-                row = {"choice": name, "number": number, "split": split, **references[key]}
-                rows.append(row | _halves(tracks, count, split, (seed, index, repeat, 0)))
+            for split, repeat in product(SPLIT, range(SPLITS)):
+                halves = _halves(tracks, count, split, (SEED, index, repeat, 0))
+                reference = halves_of_random(
+                    max(count, MIN_RANDOM), split, (SEED, index, repeat, 1)
+                )
+                row = {"choice": name, "number": number, "split": split, **halves}
+                rows.append(row | {f"random_{name}": value for name, value in reference.items()})
     medians = pd.DataFrame(rows).groupby(["choice", "number", "split"], sort=False).median()
-    table = medians[["keypoints"]].copy()
-    for motion in MOTIONS:
-        table[motion] = medians[f"random_{motion}_variance"] / medians[f"{motion}_variance"]
-    for motion in MOTIONS:
-        table[f"{motion}_deg"] = medians[f"{motion}_deg"]
-    table = table.reset_index()
+    for name in MOTIONS:
+        medians[name] = medians[f"random_{name}_variance"] / medians[f"{name}_variance"]
+    table = medians[["keypoints", *MOTIONS, *(f"{name}_deg" for name in MOTIONS)]].reset_index()
     table.insert(0, "sequence", sequence.name)
     table.insert(4, "steps", len(steps))
     return table
@@ -178,33 +175,21 @@ def tracked(
     visible = sequence.visible(index)
     made = {id(masks): masks[index] for _, masks in choices.values() if masks is not None}
     everything = {_RANDOM: (THESIS, None), **choices}
-    tracks = {}
-    alike: dict[tuple, dict] = {}  # keypoints that are tracked in the same way, at once
+    points = {}
     for key, (settings, masks) in everything.items():
-        own = calls.get(key[0], shared.calls)
-        points = own.detect(frame, settings, inside(visible, made.get(id(masks))))
-        how = (settings.window, settings.levels, key if key[0] in calls else None)
-        alike.setdefault(how, {})[key] = points
-    for (*_, own_key), group in alike.items():
-        track = calls[own_key[0]].track if own_key else shared.calls.track
-        together = np.concatenate(list(group.values()))
-        inverse = np.arange(len(together))
-        if own_key is None:
-            together, inverse = np.unique(together, axis=0, return_inverse=True)
-        moved, found = together, np.zeros(len(together), bool)
-        if len(together):
-            moved, found = track(frame, following, together, everything[next(iter(group))][0])
-        first = 0
-        for key, points in group.items():
-            places = inverse.ravel()[first : first + len(points)]
-            first += len(points)
-            tracks[key] = Tracks(
-                points,
-                normalise(points, sequence.intrinsics),
-                normalise(moved[places], sequence.intrinsics),
-                found[places],
-                everything[key][0].threshold,
-            )
+        detect = calls.get(key[0], shared.calls).detect
+        points[key] = detect(frame, settings, inside(visible, made.get(id(masks))))
+    # those of all choices, at once
+    shared.expect(following, [SimpleNamespace(points=p, previous=frame) for p in points.values()])
+    tracks = {}
+    for key, chosen in points.items():
+        settings, _ = everything[key]
+        moved, found = chosen, np.zeros(0, bool)
+        if len(chosen):
+            track = calls.get(key[0], shared.calls).track
+            moved, found = track(frame, following, chosen, settings)
+        before, now = (normalise(pixels, sequence.intrinsics) for pixels in (chosen, moved))
+        tracks[key] = Tracks(chosen, before, now, found, settings.threshold)
     return tracks.pop(_RANDOM), tracks
 
 
@@ -294,20 +279,16 @@ def choices(
             chosen[source.name] = THESIS, None
         if source.kind in UNMASKED:
             continue
-        width_of_source = width if source.has_width else None
-        masks = source.masks(sequence, width_of_source)
+        masks = source.masks(sequence, width)
         chosen[f"{prefix}masks"] = masked, masks
         if number:
             chosen[f"{prefix}strongest on the masks"] = replace(masked, max_keypoints=number), masks
         if with_controls:
             more = filled(FILL, masked.detector)
             chosen[f"{prefix}masks, filled"] = replace(masked, detector=more), masks
-            for method in methods.MASK_CONTROLS:
-                if not jobs.is_possible(method, source, sequence):
-                    continue
-                width_of_method = width if method in methods.OF_LABEL_MAPS else width_of_source
-                _, control = methods.METHODS[method].choose(sequence, source, width_of_method)
-                chosen[prefix + methods.METHODS[method].title] = masked, control
+            for name, width_of_control in jobs.mask_controls(source, sequence, width).items():
+                _, control = METHODS[name].choose(sequence, source, width_of_control)
+                chosen[prefix + METHODS[name].title] = masked, control
     return {(name, number): choice for name, choice in chosen.items()}, calls
 
 
@@ -327,28 +308,29 @@ def measure(
     options: of `choices`.
     """
     sources, numbers = list(sources), list(numbers)
-    files: dict[Path, tuple] = {}
-    for sequence in sequences:
-        inputs = {
-            "sequence": provenance.digest_of_files(sequence.files),
-            "sources": [source.record(sequence.name) for source in sources],
-            "width": width,
-            "options": options,
-            "code": provenance.digest_of_code(
-                *CODE, "thesis_repro.study.methods", "thesis_repro.study.worth"
-            ),
-            **provenance.made_with("opencv", "numpy", "numba"),
-        }
-        stage = provenance.stage(folder / sequence.name, **inputs)
-        for number in numbers:
-            files[stage / f"{number}.csv"] = sequence, sources, width, number, options
-    waiting = [(file, *call) for file, call in files.items() if not file.is_file()]
-    with open_pool(processes, scheduler) as pool:
-        for _ in pool.run(_measure_one, waiting):
-            pass
-    return pd.concat(
-        [pd.read_csv(file, dtype={"sequence": str}) for file in files], ignore_index=True
+    code = provenance.digest_of_code(
+        *CODE, "thesis_repro.study.methods", "thesis_repro.study.worth"
     )
+    calls: list[tuple] = []
+    for sequence in sequences:
+        stage = provenance.stage(
+            folder / sequence.name,
+            sequence=provenance.digest_of_files(sequence.files),
+            sources=[source.record(sequence.name) for source in sources],
+            width=width,
+            options=options,
+            code=code,
+            **provenance.made_with("opencv", "numpy", "numba"),
+        )
+        calls += [
+            (stage / f"{number}.csv", sequence, sources, width, number, options)
+            for number in numbers
+        ]
+    with open_pool(processes, scheduler) as pool:
+        for _ in pool.run(_measure_one, [call for call in calls if not call[0].is_file()]):
+            pass
+    tables = [pd.read_csv(file, dtype={"sequence": str}) for file, *_ in calls]
+    return pd.concat(tables, ignore_index=True)
 
 
 def _measure_one(
@@ -360,14 +342,12 @@ def _measure_one(
     options: Mapping[str, Any],
 ) -> None:
     chosen, calls = choices(sequence, sources, width, number, **options)
-    description = f"worth of keypoints, {sequence.name}"
     try:
-        table = worth(sequence, chosen, calls=calls, description=description)
+        table = worth(sequence, chosen, calls)
     except InputError:
         raise
     except Exception as error:  # of own keypoints
-        reason = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
-        raise InputError(f"{sequence.folder}: {reason}") from error
+        raise InputError(f"{sequence.folder}: {cause(error)}") from error
     provenance.write_table(file, table)
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from thesis_repro.odometry.refined.fit import fit, smaller_rotation
+from thesis_repro.odometry.refined import fit
 from thesis_repro.odometry.refined.motion_prior import MotionPrior, check_consistency
 from thesis_repro.odometry.step import Matches, Motion
 
@@ -26,7 +26,7 @@ class RefinedEstimator:
         not compared with it.
         """
         # RANSAC's order: sums in another order have other last digits
-        motion = fit(*smaller_rotation(essential), _in_order_of_ransac(matches))
+        motion = fit.fit(*fit.smaller_rotation(essential), _in_order_of_ransac(matches))
         if not moves:
             return motion
         motion, self.prior, flag = check_consistency(motion, matches, scale, self.prior)

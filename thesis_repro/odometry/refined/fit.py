@@ -165,15 +165,8 @@ def near_epipolar_lines(essential, points, limit):
 @compiled
 def _support(r, t, points, threshold):
     """The points (4, N) that support a motion."""
-    mask = _near(r, t, points, SUPPORT_THRESHOLDS * threshold)
-    support = np.empty((4, mask.sum()))
-    place = 0
-    for k in range(len(mask)):
-        if mask[k]:
-            for row in range(4):
-                support[row, place] = points[row, k]
-            place += 1
-    return support
+    supporting = _near(r, t, points, SUPPORT_THRESHOLDS * threshold)
+    return points[:, np.flatnonzero(supporting)]
 
 
 @compiled

@@ -101,21 +101,20 @@ def _rotation(e, t):
     """
     size = np.sqrt(2.0)  # the norm of [t]x R
     first, second, third = (e[0], e[1], e[2]), (e[3], e[4], e[5]), (e[6], e[7], e[8])
-    r0, r1, r2 = matrices.cross(second, third)  # a row of the cofactors
-    r3, r4, r5 = matrices.cross(third, first)
-    r6, r7, r8 = matrices.cross(first, second)
+    # the cofactors, row by row
+    r = matrices.cross(second, third) + matrices.cross(third, first) + matrices.cross(first, second)
     c0, c3, c6 = matrices.cross(t, (e[0], e[3], e[6]))  # a column of [t]x E
     c1, c4, c7 = matrices.cross(t, (e[1], e[4], e[7]))
     c2, c5, c8 = matrices.cross(t, (e[2], e[5], e[8]))
     square = size * size
     return (
-        square * r0 - size * c0,
-        square * r1 - size * c1,
-        square * r2 - size * c2,
-        square * r3 - size * c3,
-        square * r4 - size * c4,
-        square * r5 - size * c5,
-        square * r6 - size * c6,
-        square * r7 - size * c7,
-        square * r8 - size * c8,
+        square * r[0] - size * c0,
+        square * r[1] - size * c1,
+        square * r[2] - size * c2,
+        square * r[3] - size * c3,
+        square * r[4] - size * c4,
+        square * r[5] - size * c5,
+        square * r[6] - size * c6,
+        square * r[7] - size * c7,
+        square * r[8] - size * c8,
     )
