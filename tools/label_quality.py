@@ -20,7 +20,8 @@ NAMES = {
     "labels_espnetv2": "ESPNetv2, trained on Cityscapes",
     "labels_version_0_6": "an earlier model of the package (0.6)",
 }
-# mean IoU that the data at hand cannot give, by folder of label maps
+# mean IoU that the data at hand cannot give, by folder of label maps. Those of the earlier model
+# are made by `predict --model` with streets.keras as it was in git before commit 2db64f9.
 MEASURED_ELSEWHERE = {
     "labels_espnetv2": (
         0.43,
