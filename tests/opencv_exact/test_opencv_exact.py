@@ -15,6 +15,7 @@ from opencv_exact import find_essential_matrix, ransac, recover_pose, solve_five
 from opencv_exact.real_roots import LANES
 from opencv_exact.solver import WELL_CONDITIONED
 
+pytestmark = pytest.mark.slow
 THRESHOLD, PROBABILITY = 0.0003, 0.999
 REFERENCE = Path(__file__).parents[1] / "reference"  # matched points of real frames
 

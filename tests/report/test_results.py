@@ -290,6 +290,7 @@ def drawn_by_cells(runs):
     return figures
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "names, noise, sources",
     [

@@ -37,7 +37,9 @@ def test_changed_sizes_are_part_of_the_name():
     assert (sizes.epochs, sizes.frames, sizes.widths, sizes.image_size) == (3, None, (5, 10), 64)
     # a size equal to the profile's is not in the name
     assert settings.run == "embedded-demo-image-size-64-epochs-3-frames-all-widths-5_10"
-    assert settings_of(FRAMES=200, WIDTHS="1,3,5,7,9-11,13,15").run == "embedded-demo"
+    of_demo = PROFILES["demo"]
+    widths = ",".join(map(str, of_demo.widths))
+    assert settings_of(FRAMES=of_demo.frames, WIDTHS=widths).run == "embedded-demo"
 
 
 @pytest.mark.parametrize(
