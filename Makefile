@@ -28,7 +28,7 @@ help:
 	@echo "                 in a container LISTEN=0.0.0.0"
 	@echo "make check-data  check the folders KITTI=/path CITYSCAPES=/path KITTI_SEMANTIC=/path"
 	@echo "make evidence    make figures PROFILE=thesis from KITTI=/path, and keep what shows no frame; LABELS='/path /path'"
-	@echo "make trainings   after make figures: train nine more networks, and compare masks from all ten (half an hour)"
+	@echo "make trainings   after make figures: train nine more networks, and compare masks from all ten (a quarter of an hour)"
 	@echo "make bench       measure the relative cost of odometry and network (KITTI=/path), into build/bench.json"
 	@echo "make weights     train the shipped model anew into build/shipped, CAMVID=/path KITTI_SEMANTIC=/path PSEUDO=/path"
 	@echo "make page, pins  write the page anew from the figures in git; resolve the pins of environment.txt anew"
