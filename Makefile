@@ -124,7 +124,8 @@ trainings: setup
 	@$(BIN)/python tools/trainings.py
 weights: setup
 	@$(BIN)/python tools/train_shipped.py "$(CAMVID)" "$(KITTI_SEMANTIC)" "$(PSEUDO)" build/shipped
-pins: setup
+# Not `setup`, which would install what is not resolved yet.
+pins: $(if $(wildcard $(BIN)/uv),,setup)
 	@$(BIN)/python tools/pins.py
 clean:
 	rm -rf .venv build *.egg-info .pytest_cache .ruff_cache .mypy_cache

@@ -8,6 +8,7 @@ import subprocess
 import tempfile
 from pathlib import Path
 
+from thesis_repro.errors import InputError
 from thesis_repro.running import program
 from thesis_repro.running.files import write_text
 from thesis_repro.running.settings import ROOT
@@ -25,7 +26,8 @@ def main() -> None:
         wanted, resolved = Path(folder, "direct.in"), Path(folder, "environment.txt")
         wanted.write_text(direct, encoding="utf-8")
         resolved.write_text(PINS.read_text(encoding="utf-8"), encoding="utf-8")
-        subprocess.run([*UV, *OPTIONS, wanted, "-o", resolved], cwd=ROOT, check=True)
+        if subprocess.run([*UV, *OPTIONS, wanted, "-o", resolved], cwd=ROOT).returncode:
+            raise InputError(f"{PINS}: uv cannot resolve its first part; see above, and change it")
         pins = resolved.read_text(encoding="utf-8").splitlines(keepends=True)
     called = {line.partition("==")[0] for line in direct.splitlines() if "==" in line}
     needed = [line for line in pins if line.partition("==")[0] not in called]

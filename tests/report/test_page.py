@@ -1,5 +1,7 @@
 """The page of a run, on a figures folder of made-up files."""
 
+import ast
+import json
 import os
 import re
 from dataclasses import replace
@@ -129,12 +131,30 @@ def test_missing_artefacts_are_listed_unless_their_data_were_not_given(run):
     assert text.count("CITYSCAPES=/path") == text.count("KITTI_SEMANTIC=/path") == 1
 
 
-def test_each_artefact_is_written_by_the_notebooks_that_are_named():
-    written = {name for names in captions.MADE_BY.values() for name in names}
-    assert written == {artefact["name"] for artefact in ARTEFACTS}
+def saved_names(notebook):
+    """The names that calls of save_figure and save_table in a notebook's cells have as strings."""
+    cells = json.loads((ROOT / "notebooks" / f"{notebook}.ipynb").read_text())["cells"]
+    sources = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
+    code = "\n".join(line for source in sources for line in source.split("\n") if line[:1] != "%")
+    for node in ast.walk(ast.parse(code)):
+        if isinstance(node, ast.Call) and ast.unparse(node.func).endswith(("_figure", "_table")):
+            strings = [each.value for each in node.args if isinstance(each, ast.Constant)]
+            yield from (text for text in strings if re.fullmatch(r"[a-z]\w+", str(text)))
+
+
+def test_each_artefact_has_a_caption_a_notebook_and_files_in_git():
+    listed, faults = {artefact["name"] for artefact in ARTEFACTS}, []
     for notebook, names in captions.MADE_BY.items():
         code = (ROOT / "notebooks" / f"{notebook}.ipynb").read_text()
-        assert [name for name in names if name not in code] == []
+        faults += [f"{notebook}.ipynb: saves no {name}" for name in names if name not in code]
+        unknown = set(saved_names(notebook)) - set(names)
+        faults += [f'captions.json: add "{name}" to made_by of {notebook}' for name in unknown]
+    written = {name for names in captions.MADE_BY.values() for name in names}
+    faults += [f'captions.json: add an entry of "{name}"' for name in written - listed]
+    faults += [f'captions.json: add "{name}" to made_by' for name in listed - written]
+    missing = [name for name in listed if not list((ROOT / "figures").glob(f"{name}.*"))]
+    faults += [f"figures/{name}: is not there; run make figures" for name in missing]
+    assert faults == []
 
 
 def test_the_gallery_has_every_artefact_in_the_order_of_the_thesis(run):
