@@ -10,6 +10,8 @@ import pytest
 
 from thesis_repro.command import cli
 from thesis_repro.command.options import build_parser
+from thesis_repro.masks import KINDS
+from thesis_repro.odometry.estimators import ESTIMATORS
 from thesis_repro.running.settings import ROOT
 
 TEXTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -17,6 +19,14 @@ TEXTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 def blocks(path, language):
     return re.findall(rf"```{language}\n(.*?)```", path.read_text(encoding="utf-8"), re.DOTALL)
+
+
+@pytest.mark.parametrize(
+    "text, names", [("own-masks", [*KINDS][1:]), ("reading-results", ESTIMATORS)]
+)
+def test_each_kind_of_mask_and_each_estimator_is_explained(text, names):
+    words = (ROOT / f"docs/{text}.md").read_text(encoding="utf-8")
+    assert [name for name in names if not re.search(rf"[` ]{name}`", words)] == []
 
 
 @pytest.mark.parametrize("path", TEXTS, ids=lambda path: path.name)

@@ -12,10 +12,13 @@ from thesis_repro import odometry
 from thesis_repro.command.cli import main
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.data.trajectories import write_kitti_poses
+from thesis_repro.errors import InputError
 from thesis_repro.odometry import metrics
+from thesis_repro.odometry.loop import VoteOfAll
 from thesis_repro.report import study_report as report
 from thesis_repro.study import sources, worth
 from thesis_repro.study.plan import Study
+from thesis_repro.study.sources import Source
 
 pytestmark = pytest.mark.slow
 
@@ -45,6 +48,18 @@ def study(root, *options):
     out = root.parent / "out"
     few = ["--estimator", "thesis", "--repetitions", 1, "--jobs", 1, "--output", out]
     return main([*map(str, ["study", "--kitti", root, *few, *options])]), out
+
+
+def test_an_own_search_beside_an_estimator_with_its_own_is_refused(street, tmp_path):
+    file = tmp_path / "search.py"
+    file.write_text("def find_essential_matrix(current, previous, threshold): return None, None")
+
+    class Searching(VoteOfAll):
+        search = staticmethod(odometry.OPENCV.find_essential_matrix)
+
+    settings = odometry.OdometrySettings(estimator=Searching)
+    with pytest.raises(InputError, match="search.py"):
+        Source(file, "keypoints").run(Sequence(street, "00"), settings)
 
 
 def test_a_sequence_whose_true_poses_are_not_the_cameras_gets_no_verdict(street, capsys):

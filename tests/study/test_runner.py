@@ -14,6 +14,7 @@ from thesis_repro import mask_files, masks, odometry
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.odometry import metrics
+from thesis_repro.odometry.estimators import VoteOfInliers
 from thesis_repro.odometry.keypoints import filtered
 from thesis_repro.running import program
 from thesis_repro.segmentation import training
@@ -231,3 +232,10 @@ def test_a_killed_worker_is_one_line_and_the_next_call_works():
         list(pool.run(signal.raise_signal, [(signal.SIGKILL,)]))
     with workers.open_pool(2) as pool:
         assert list(pool.run(abs, [(-2,), (-1,)])) == [2, 1]
+
+
+def test_an_estimator_is_recorded_with_the_classes_that_it_builds_on():
+    class Own(VoteOfInliers):
+        """Changes nothing."""
+
+    assert "class VoteOfInliers" in runner._code(Own) and "class VoteOfAll" in runner._code(Own)

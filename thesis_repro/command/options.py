@@ -302,10 +302,11 @@ def named(command: str) -> dict[str, dict[str, Any]]:
     from thesis_repro.odometry.estimators import COMPARED, DETECTORS, ESTIMATORS
 
     where = ", ".join(kind.help for kind in KINDS.values())
+    titles = "; ".join(f"{name}: {entry.title}" for name, entry in ESTIMATORS.items())
     estimators: dict[str, Any] = dict(
         choices=list(ESTIMATORS),
         default="thesis",
-        help="motion by a vote of all matched points (PySLAM) or of RANSAC's inliers, or by least squares (thesis)",
+        help=f"what estimates a motion: {titles} (thesis)",
     )
     if command == "study":
         default = " ".join(COMPARED)

@@ -86,6 +86,12 @@ class Source:
         """Return the run with own keypoints, or a path as if it were a run."""
         brought = self.read(sequence)
         if isinstance(brought, odometry.Calls):
+            own_search = brought.find_essential_matrix is not odometry.OPENCV.find_essential_matrix
+            if own_search and hasattr(settings.estimator, "search"):
+                raise InputError(
+                    f"{self.folder}: find_essential_matrix would not be used, because this estimator has a "
+                    "search of its own; choose another --estimator"
+                )
             return odometry.run(sequence, settings, calls=brought)
         steps = [odometry.Step(index, pose=pose) for index, pose in enumerate(brought)]
         return odometry.Result(brought, pd.DataFrame([step.row() for step in steps]))

@@ -309,7 +309,10 @@ def measure(
     """
     sources, numbers = list(sources), list(numbers)
     code = provenance.digest_of_code(
-        *CODE, "thesis_repro.study.methods", "thesis_repro.study.worth"
+        *CODE,
+        "thesis_repro.study.methods",
+        "thesis_repro.study.worth",
+        without=("thesis_repro.odometry.estimators",),  # all motions are refined ones
     )
     calls: list[tuple] = []
     for sequence in sequences:
