@@ -39,12 +39,18 @@ def figure_comparison(table: pd.DataFrame) -> Figure:
     rows = _drawn(table)
     rows = rows[rows["metric"].isin(compare.JUDGING_METRICS)]
     sequences = compare.sequences_of(table)
-    order = list(rows["label"].unique())
-    estimators = [name for name in ESTIMATORS if (rows["estimator"] == name).any()]
+    orders = {name: list(part["label"].unique()) for name, part in rows.groupby("estimator")}
+    estimators = [name for name in ESTIMATORS if name in orders]
     metrics = [name for name in compare.JUDGING_METRICS if (rows["metric"] == name).any()]
-    height = 0.7 + (0.8 + 0.33 * len(order)) * len(estimators)
+    heights = [0.8 + 0.33 * len(orders[name]) for name in estimators]  # of the panels, inches
     figure, axes = style.new_figure(
-        len(estimators), len(metrics), squeeze=False, sharex=True, sharey=True, height=height
+        len(estimators),
+        len(metrics),
+        squeeze=False,
+        sharex=True,
+        sharey="row",
+        height=0.7 + sum(heights),
+        height_ratios=heights,
     )
     distances = rows[sequences].astype(float).map(np.log).abs()
     brought = distances[rows["method"].isin(BROUGHT)].stack()
@@ -59,7 +65,7 @@ def figure_comparison(table: pd.DataFrame) -> Figure:
         panels[0].set_ylabel(ESTIMATORS[estimator])
         for panel, metric in zip(panels, metrics, strict=True):
             of_panel = rows[(rows["estimator"] == estimator) & (rows["metric"] == metric)]
-            _draw_ratios(panel, of_panel, order, sequences, reach)
+            _draw_ratios(panel, of_panel, orders[estimator], sequences, reach)
     for panel, metric in zip(axes[0], metrics):
         panel.set_title(compare.METRICS[metric])
     for panel in axes[-1]:
