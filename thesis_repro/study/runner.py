@@ -306,9 +306,13 @@ def _record(masks: Any) -> Any:
 def _code(estimator: Any) -> str:
     """Return the code of an estimator, which a person may have added to the table of names."""
     parts = inspect.getmro(estimator) if inspect.isclass(estimator) else [estimator]
-    with suppress(OSError, TypeError):  # the thesis's, which is None, or of a console
-        return "".join(inspect.getsource(part) for part in parts if part.__module__ != "builtins")
-    return ""
+    code = ""
+    for part in parts:
+        with suppress(
+            OSError, TypeError
+        ):  # the thesis's, which is None, of Python, or of a console
+            code += inspect.getsource(part)
+    return code
 
 
 def _versions() -> dict[str, Any]:
