@@ -15,7 +15,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from thesis_repro.report import style
-from thesis_repro.report.worth import SHOWN
+from thesis_repro.report.worth import SHOWN, table_of
 from thesis_repro.study.worth import DECIDING, MOTIONS, SPLIT, typical
 
 REFERENCE = DECIDING  # random keypoints
@@ -46,22 +46,13 @@ def equivalent(worths) -> pd.DataFrame:
 
 def table(worths) -> pd.DataFrame:
     """Return one row a choice and number: typical equivalent numbers and their 95 % intervals."""
-    rows = []
-    for row in _typical(worths).to_dict("records"):
-        line = {
-            "choice": row["choice"],
-            "drawn": row["number"] or "all",
-            "keypoints": f"{row['keypoints']:.0f}",
-        }
-        for split in SPLIT:
-            for motion in SHOWN:
-                name = f"{motion}_{split}"
-                text = f"{row[name]:.0f}"
-                if not np.isnan(row[f"{name}_low"]):
-                    text += f" ({row[f'{name}_low']:.0f}-{row[f'{name}_high']:.0f})"
-                line[f"tell as much as, {motion}, by {split}"] = text
-        rows.append(line)
-    return pd.DataFrame(rows)
+    return table_of(_typical(worths), _cell, "tell as much as, ")
+
+
+def _cell(row, name) -> str:
+    if np.isnan(row[f"{name}_low"]):
+        return f"{row[name]:.0f}"
+    return f"{row[name]:.0f} ({row[f'{name}_low']:.0f}-{row[f'{name}_high']:.0f})"
 
 
 def _typical(worths) -> pd.DataFrame:
@@ -76,7 +67,9 @@ def figure(worths) -> Figure:
     drawing, panels = style.new_figure(1, 2, sharey=True, height=3.8)
     for panel, motion in zip(panels, SHOWN, strict=True):
         ends = rows["keypoints"].min(), rows["keypoints"].max()
-        panel.plot(ends, ends, color=style.GRAY, linewidth=0.8, label="each as much as one of 400")
+        panel.plot(
+            ends, ends, color=style.GRAY, linewidth=0.8, label=f"each as much as one of {REFERENCE}"
+        )
         for choice, color in CURVES.items():
             of_choice = rows[rows["choice"] == choice]
             for split, dash in zip(SPLIT, ("o-", "o:"), strict=True):

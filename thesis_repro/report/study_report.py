@@ -1,4 +1,4 @@
-"""The results of a study with the user's masks: findings, figures, tables and a html.
+"""The results of a study with the user's masks: findings, figures, tables and a page.
 
 Tables are also written as LaTeX and figures as PDF, for use in a paper.
 """
@@ -43,7 +43,7 @@ def write(
 ) -> Path:
     """Write the findings, figures, tables and page of a `Study` into a folder.
 
-    Returns the page's path. warnings: lines for the top of the html. worths: of `Study.worths`.
+    Returns the page's path. warnings: lines for the top of the page. worths: of `Study.worths`.
     """
     # `thesis-repro synthesize` leaves a record beside the KITTI folder of an embedded world
     embedded = "train_images" in (provenance.record(study.kitti.resolve().parent) or {})

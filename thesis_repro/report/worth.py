@@ -1,5 +1,6 @@
 """Table and figure of what a keypoint of each choice is worth (study/worth.py)."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -21,8 +22,17 @@ def table(worths: pd.DataFrame) -> pd.DataFrame:
 
     worths: of `worth.worth`, of several sequences. A cell says "0.51 (0.20-0.67), 7 of 8 below 1".
     """
-    rows = []
-    for row in typical(worths).to_dict("records"):
+    rows = typical(worths)
+    return table_of(rows, cell).assign(**{"a keypoint tells": rows["verdict"]})
+
+
+def table_of(rows: pd.DataFrame, text: Callable[[dict, str], str], title: str = "") -> pd.DataFrame:
+    """Return the rows of `worth.typical` for readers, with a text for each motion and split.
+
+    text: from a row and the name of a number, such as rotation_fields. title: before its column's.
+    """
+    lines = []
+    for row in rows.to_dict("records"):
         line = {
             "choice": row["choice"],
             "drawn": row["number"] or "all",
@@ -30,9 +40,9 @@ def table(worths: pd.DataFrame) -> pd.DataFrame:
         }
         for split in SPLIT:
             for motion in SHOWN:
-                line[f"{motion}, by {split}"] = cell(row, f"{motion}_{split}")
-        rows.append({**line, "a keypoint tells": row["verdict"]})
-    return pd.DataFrame(rows)
+                line[f"{title}{motion}, by {split}"] = text(row, f"{motion}_{split}")
+        lines.append(line)
+    return pd.DataFrame(lines)
 
 
 def cell(row: dict, name: str) -> str:

@@ -308,9 +308,8 @@ def _code(estimator: Any) -> str:
     parts = inspect.getmro(estimator) if inspect.isclass(estimator) else [estimator]
     code = ""
     for part in parts:
-        with suppress(
-            OSError, TypeError
-        ):  # the thesis's, which is None, of Python, or of a console
+        # the thesis's (None), what is Python's own, and what was typed into a console have none
+        with suppress(OSError, TypeError):
             code += inspect.getsource(part)
     return code
 
