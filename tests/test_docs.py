@@ -12,7 +12,7 @@ from thesis_repro.command import cli
 from thesis_repro.command.options import build_parser
 from thesis_repro.masks import KINDS
 from thesis_repro.odometry.estimators import ESTIMATORS
-from thesis_repro.running.settings import ROOT
+from thesis_repro.running.settings import PROFILES, ROOT
 
 TEXTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 
@@ -27,6 +27,16 @@ def blocks(path, language):
 def test_each_kind_of_mask_and_each_estimator_is_explained(text, names):
     words = (ROOT / f"docs/{text}.md").read_text(encoding="utf-8")
     assert [name for name in names if not re.search(rf"[` ]{name}`", words)] == []
+
+
+@pytest.mark.parametrize("name, sizes", PROFILES.items(), ids=list(PROFILES))
+def test_the_table_of_profiles_has_their_sizes(name, sizes):
+    text = (ROOT / "docs/clusters.md").read_text(encoding="utf-8")
+    (row,) = re.findall(rf"^\| `{name}`.*", text, re.MULTILINE)
+    images, frames = sizes.training_images or "all", sizes.frames or "all"
+    assert f"{sizes.image_size}x{sizes.image_size}, {sizes.base_filters} filters" in row
+    assert f"| {sizes.epochs}, {images}, {sizes.batch_size}, {sizes.learning_rate:g}" in row
+    assert f" {frames} frames, {len(sizes.widths)} widths, {sizes.repetitions} repetitions" in row
 
 
 @pytest.mark.parametrize("path", TEXTS, ids=lambda path: path.name)
