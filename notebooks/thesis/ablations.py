@@ -44,12 +44,18 @@ class FunctionMasks:
         return self.function(index)
 
 
+@lru_cache(maxsize=2)  # several masks of one frame use it
+def all_keypoints(sequence: Sequence, index: int) -> np.ndarray:
+    """Return the thesis's keypoints (n, 2) of a frame."""
+    return detect(sequence.frame(index), THESIS)
+
+
 def random_keypoints(sequence: Sequence, amount: int | float, index: int) -> np.ndarray:
     """Return a mask that keeps randomly drawn keypoints of a frame, one pixel each.
 
     amount: their number (int), or their share of all keypoints (float).
     """
-    points = detect(sequence.frame(index), THESIS).astype(int)
+    points = all_keypoints(sequence, index).astype(int)
     if isinstance(amount, float):
         amount = round(amount * len(points))
     shuffled = np.random.default_rng((0, index)).permutation(points)
@@ -66,7 +72,7 @@ def parallax(sequence: Sequence, index: int) -> tuple[np.ndarray, np.ndarray]:
     Parallax (pixels): how far a point moves beyond what the true rotation explains. It is large for
     near points and small for distant ones. Uses the ground truth, which an odometry does not have.
     """
-    points = detect(sequence.frame(index), THESIS)
+    points = all_keypoints(sequence, index)
     moved, tracked = track(sequence.frame(index), sequence.frame(index + 1), points)
     motion = np.linalg.inv(sequence.poses[index]) @ sequence.poses[index + 1]
     rays = np.column_stack([normalise(points, sequence.intrinsics), np.ones(len(points))])

@@ -235,6 +235,7 @@ def comparisons(runs: pd.DataFrame) -> pd.DataFrame:
         for (variant, errors), (reference, reference_errors) in product(variants, variants):
             if not _is_compared(variant, reference):
                 continue
+            of_failures = failures(errors["failed"], reference_errors["failed"])
             for metric in metrics:
                 by_sequence = np.exp((errors[metric] - reference_errors[metric]).dropna())
                 if by_sequence.empty:
@@ -250,7 +251,7 @@ def comparisons(runs: pd.DataFrame) -> pd.DataFrame:
                     and estimator == judging,
                     "far_off": far_off(by_sequence),
                     **typical_ratio(by_sequence),
-                    **failures(errors["failed"], reference_errors["failed"]),
+                    **of_failures,
                     **by_sequence,
                 }
                 rows.append(row)

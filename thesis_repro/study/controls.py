@@ -4,6 +4,7 @@ Masks are indexed by frame number, as in `masks`.
 """
 
 from dataclasses import replace
+from itertools import repeat
 from typing import Any
 
 import cv2
@@ -12,7 +13,6 @@ import numpy as np
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.masks import dilate
 from thesis_repro.odometry import THESIS
-from thesis_repro.odometry.loop import detect
 from thesis_repro.study.sources import Source
 
 LARGEST_GRADIENT = 8 * 255  # |dx| + |dy| of 3x3 Sobel operators
@@ -130,12 +130,17 @@ def min_distance(sequence: Sequence, number: float) -> float:
     The distance (pixels) is the setting of the detector. It is found by bisection on SAMPLE frames
     of the sequence, and is never below the distance of the thesis.
     """
+    from thesis_repro.odometry import corners  # loads the compiler
+
     sample = np.unique(np.linspace(0, len(sequence) - 1, SAMPLE).round().astype(int))
-    frames = [(sequence.frame(index), sequence.visible(index)) for index in sample]
+    # the corners of a frame are ranked once for all distances, with OpenCV's bits
+    ranked = [corners.find_corners(sequence.frame(index), THESIS.block_size) for index in sample]
+    visible = [sequence.visible(index) for index in sample]
 
     def mean_number(distance: float) -> float:
         settings = replace(THESIS, min_distance=distance)
-        return float(np.mean([len(detect(frame, settings, visible)) for frame, visible in frames]))
+        found = map(corners.strongest, ranked, repeat(settings), visible)
+        return float(np.mean([len(points) for points in found]))
 
     low, high = 0, round(min(sequence.size) / STEP)
     distances = [round(THESIS.min_distance + step * STEP, 6) for step in range(high)]

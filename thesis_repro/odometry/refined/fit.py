@@ -132,8 +132,8 @@ def _deviations(
 
 
 def columns(matches: Matches) -> np.ndarray:
-    """Matches as (4, N): x, y, u and v."""
-    return np.concatenate([matches.current.T, matches.previous.T])
+    """Matches as (4, N), C-contiguous: x, y, u and v."""
+    return np.array([*matches.current.T, *matches.previous.T])
 
 
 def near(
