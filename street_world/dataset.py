@@ -13,15 +13,18 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from joblib import Parallel, delayed, effective_n_jobs
+from joblib import cpu_count as cores
 
 from street_world import drives, street, textures
 from thesis_repro.data import kitti, trajectories
-from thesis_repro.running import program, provenance
+from thesis_repro.running import provenance
 from thesis_repro.running.files import progress, write_png, write_text
+from thesis_repro.running.workers import open_pool
 
 SEQUENCES = tuple(drives.DRIVES)
 BASELINE = 0.537  # metres between KITTI's cameras, for P1 and P3 of the calibration file
+# for which one more process pays: it starts in the time of forty pictures
+PICTURES_OF_A_WORKER = 150
 IMAGE_SIZE = (512, 1024)  # height and width of the training images at scale 1
 CITIES = {
     "train": ("birkenstadt", "fuchsheim", "morgental", "silberau", "tannfeld"),
@@ -230,25 +233,18 @@ def _pictures(
 
 def _write_missing(missing: list[Picture], jobs: int) -> None:
     """Render and write pictures in several processes."""
-    workers = min(effective_n_jobs(jobs), 1 + len(missing) // 40)
+    workers = min(cores() if jobs < 0 else jobs, 1 + len(missing) // PICTURES_OF_A_WORKER)
     first = "starting the renderer (its first use compiles it, up to a minute)"
     with progress(description=first, total=len(missing), unit="picture") as bar:
         bar.refresh()  # shown before the first picture is done
         # compiles the rasteriser once, for all worker processes
         bar.update(_write_pictures(missing[:1]))
         bar.set_description("rendering the embedded world", refresh=False)
-        parallel = Parallel(
-            n_jobs=workers,
-            return_as="generator_unordered",
-            initializer=program.leave_ctrl_c_to_parent,
-        )
         # Ten at a time, because pictures of one sequence share its street.
-        starts = range(1, len(missing), 10)
-        work = (delayed(_write_pictures)(missing[start : start + 10]) for start in starts)
-        with program.starting_workers():
-            counts = parallel(work)
-        for count in counts:
-            bar.update(count)
+        calls = [(missing[start : start + 10],) for start in range(1, len(missing), 10)]
+        with open_pool(workers) as pool:
+            for count in pool.run(_write_pictures, calls):
+                bar.update(count)
 
 
 def _write_pictures(pictures: list[Picture]) -> int:

@@ -16,7 +16,7 @@ def main() -> None:
         settings.world,
         **settings.sizes.world,
         seed=settings.seed,
-        jobs=settings.jobs,
+        jobs=1,  # training has the other core
         only="kitti",
         replace=not settings.cityscapes_is_embedded,
     )

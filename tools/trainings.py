@@ -20,11 +20,11 @@ import pandas as pd
 import tensorflow as tf
 
 from thesis_repro.data import cityscapes, kitti
-from thesis_repro.running import files, program, provenance
+from thesis_repro.running import files, program, provenance, workers
 from thesis_repro.running.settings import ALL_WIDTHS, ROOT, read_settings
 from thesis_repro.segmentation import prediction, quality, training
 from thesis_repro.segmentation.unet import build_unet
-from thesis_repro.study import compare, jobs, runner, workers
+from thesis_repro.study import compare, jobs, runner
 from thesis_repro.study.sources import Source
 
 sys.path.append(str(ROOT / "notebooks"))

@@ -11,7 +11,8 @@ from trials import ROOT, wait_for
 
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
-from thesis_repro.study import runner, workers
+from thesis_repro.running import workers
+from thesis_repro.study import runner
 from thesis_repro.study.jobs import first_jobs
 
 pytestmark = pytest.mark.slow

@@ -27,13 +27,13 @@ from thesis_repro.odometry.estimators import COMPARED
 from thesis_repro.odometry.runs import is_flagged, poses_of
 from thesis_repro.running import program, provenance
 from thesis_repro.running.files import listed, progress, write_text
+from thesis_repro.running.workers import open_pool
 from thesis_repro.study import compare
 from thesis_repro.study.controls import OtherFrame, min_distance
 from thesis_repro.study.errors import path_errors
 from thesis_repro.study.jobs import Job, in_passes, repeated
 from thesis_repro.study.methods import METHODS
 from thesis_repro.study.sources import UNMASKED, Source, by_name
-from thesis_repro.study.workers import open_pool
 
 # rooms whose code decides the poses
 CODE = (

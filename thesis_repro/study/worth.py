@@ -80,11 +80,11 @@ from thesis_repro.odometry.runs import check, inside
 from thesis_repro.odometry.sharing import SharedCalls
 from thesis_repro.running import provenance
 from thesis_repro.running.files import progress
+from thesis_repro.running.workers import open_pool
 from thesis_repro.study import compare, jobs
 from thesis_repro.study.methods import METHODS
 from thesis_repro.study.runner import CODE
 from thesis_repro.study.sources import UNMASKED, Source, own_calls
-from thesis_repro.study.workers import open_pool
 
 NUMBERS = (100, 200, 400)
 DECIDING = 400  # keypoints
