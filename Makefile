@@ -28,7 +28,7 @@ help:
 	@echo "                 in a container LISTEN=0.0.0.0"
 	@echo "make check-data  check the folders KITTI=/path CITYSCAPES=/path KITTI_SEMANTIC=/path"
 	@echo "make evidence    make figures PROFILE=thesis from KITTI=/path, and keep what shows no frame; LABELS='/path /path'"
-	@echo "make trainings   after make figures: train nine more networks, and compare masks from all ten (a quarter of an hour)"
+	@echo "make trainings   after make figures: train nine more networks, and compare masks from all ten (some ten minutes)"
 	@echo "make bench       measure the relative cost of odometry and network (KITTI=/path), into build/bench.json"
 	@echo "make weights     train the shipped model anew into build/shipped, CAMVID=/path KITTI_SEMANTIC=/path PSEUDO=/path"
 	@echo "make page, pins  write the page anew from the figures in git; resolve the pins of environment.txt anew"
@@ -81,11 +81,11 @@ $(call executed,07 08): $(call executed,06)
 $(call executed,09): $(call executed,08)
 $(foreach name,$(NAMES),$(eval $(RUN)/notebooks/$(name).ipynb: $(call imports,notebooks/$(name).ipynb)))
 
-# nbconvert writes under another name: a notebook that exists is done.
+# nbconvert writes under another name: a notebook that exists is done. Its kernel has nothing to do at its end.
 $(RUN)/notebooks/%.ipynb: notebooks/%.ipynb $(RUN)/checked
 	@trap 'kill $$!; exit 130' INT TERM HUP; \
 	$(BIN)/jupyter nbconvert --to notebook --execute --ExecutePreprocessor.kernel_name=python3 \
-	  --ExecutePreprocessor.timeout=-1 --output-dir $(@D) --output .$* $< >$(@:.ipynb=.log) 2>&1 & wait $$! \
+	  --ExecutePreprocessor.timeout=-1 --ExecutePreprocessor.shutdown_kernel=immediate --output-dir $(@D) --output .$* $< >$(@:.ipynb=.log) 2>&1 & wait $$! \
 	&& mv $(@D)/.$*.ipynb $@ && echo "$*: done in $$SECONDS s" \
 	|| { echo "$* failed: $$(tr -d '\033' <$(@:.ipynb=.log) | sed 's/\[[0-9;]*m//g' | grep . | tail -n 1) ($(@:.ipynb=.log))" >&2; exit 1; }
 $(RUN)/checked: FORCE  # rewritten only if the data has changed

@@ -17,6 +17,8 @@ PINS = ROOT / "environment.txt"
 HEADING = "# What those need:\n"
 UV = [".venv/bin/uv", "pip", "compile", "--quiet", "--universal", "--python-version", "3.11"]
 OPTIONS = ["--fork-strategy", "fewest", "--no-header", "--no-annotate"]
+# jsonschema does without it; its import takes a second in each notebook that is executed
+LEFT_OUT = ("rfc3987-syntax", "lark")
 
 
 def main() -> None:
@@ -30,7 +32,7 @@ def main() -> None:
             raise InputError(f"{PINS}: uv cannot resolve its first part; see above, and change it")
         pins = resolved.read_text(encoding="utf-8").splitlines(keepends=True)
     called = {line.partition("==")[0] for line in direct.splitlines() if "==" in line}
-    needed = [line for line in pins if line.partition("==")[0] not in called]
+    needed = [line for line in pins if line.partition("==")[0] not in {*called, *LEFT_OUT}]
     write_text(PINS, direct + heading + "\n" + "".join(needed))
 
 
