@@ -455,8 +455,8 @@ def claims_of_answer():
 # numbers of no table: parameters, versions, years, names of streets, what others say
 FACTS = {
     "README.md": """
-        and 200 spread ones; one of 400 spread; Python 3.11 to 3.13; takes 6 minutes and 2.4 GB;
-        `make test` 5.; x86 with;
+        and 200 spread ones; one of 400 spread; Python 3.11 to 3.13; takes 4 minutes and 2.4 GB;
+        `make test` 3.; x86 with;
         AVX2; Apple processor; by -13.2 %.; in 6 of 11 drives; | 200 spread ones;
         3 to 5 times fewer; 5 to 10 % of; 95 % intervals; rows 47 and 16; Figure A.1; GPL-3.0;
         BY-NC-SA 3.0; CC BY-NC-SA 3.0""",

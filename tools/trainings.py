@@ -55,9 +55,10 @@ def train(settings, seed):
     )
     keras.utils.set_random_seed(seed)
     model = build_unet(arrays["train_images"].shape[1:], cityscapes.N_CLASSES, sizes.base_filters)
-    model.compile(
-        keras.optimizers.Adam(sizes.learning_rate), training.fused_loss(training.total_loss())
-    )
+    rate = sizes.learning_rate
+    if sizes.rate_falls:
+        rate = training.falling_rate(rate, sizes.epochs, batches)
+    model.compile(keras.optimizers.Adam(rate), training.fused_loss(training.total_loss()))
     folder = provenance.stage(
         settings.build / f"trainings/model_{seed}",
         **training.made_from(model, batches, validation),

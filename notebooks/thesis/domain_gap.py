@@ -10,6 +10,7 @@ import pandas as pd
 from thesis_repro.data import cityscapes, kitti
 
 IMAGES = 100  # most images of a domain
+LABELLED_FRAMES = 50  # about as many of all drives
 FRAMES = "the odometry's frames"  # the domain for which masks are made
 # a model and a domain with images that are in the model's training data
 SEEN = ("the model in the package", "KITTI's street scenes")
@@ -58,7 +59,7 @@ def labelled_frames(drives: list[kitti.Sequence]) -> list[cityscapes.Pair]:
     for drive in drives:
         label_folder = drive.folder / kitti.TRUE_LABELS
         if label_folder.is_dir():
-            count = min(len(drive), max(1, IMAGES // len(drives)))
+            count = min(len(drive), max(1, LABELLED_FRAMES // len(drives)))
             middles = (np.arange(count) + 0.5) * len(drive) / count  # of equal parts of the drive
             for path in (drive.frame_paths[index] for index in middles.astype(int)):
                 name = f"{drive.name}_{path.stem}"

@@ -71,15 +71,20 @@ MARGINS = {"se3": 1.25, "rotation": 1.1}  # a ratio between 1 / margin and margi
 NEAR = 0.8, 1.5  # of the panels that show ratios near 1 enlarged
 
 
-def choices(sequence: Sequence, labels: Path) -> dict[tuple[str, int], tuple]:
-    """Return {(choice, number of keypoints asked for, 0 for no limit): (settings, masks)}."""
+def choices(
+    sequence: Sequence, labels: Path, numbers: Iterable[int] = ()
+) -> dict[tuple[str, int], tuple]:
+    """Return {(choice, number of keypoints asked for, 0 for no limit): (settings, masks)}.
+
+    numbers: NUMBERS if there are none.
+    """
     masks = LabelMasks(labels, sequence, CONTROL_WIDTH)
     chosen: dict[tuple[str, int], tuple] = {
         ("all", 0): (THESIS, None),
         ("mask", 0): (THESIS, masks),
         ("filled", 0): (replace(THESIS, detector=filled(FILL)), masks),
     }
-    for number in NUMBERS:
+    for number in numbers or NUMBERS:
         few = replace(THESIS, max_keypoints=number)
         drawn = FunctionMasks(partial(random_keypoints, sequence, number))
         chosen |= {
@@ -97,14 +102,16 @@ def measure(
     folder: Path,
     processes: int = 1,
     repetitions: int = REPETITIONS,
+    numbers: Iterable[int] = (),
 ) -> pd.DataFrame:
     """Run all choices on sequences. Returns one row a run; finished sequences are not repeated.
 
-    labels: a folder with one folder of label maps a sequence. folder: of the results.
+    labels: a folder with one folder of label maps a sequence. folder: of the results. numbers: of
+    keypoints, NUMBERS if there are none.
     """
 
     def named(sequence: Sequence) -> dict[str, tuple]:
-        of_sequence = choices(sequence, labels).items()
+        of_sequence = choices(sequence, labels, numbers).items()
         return {f"{choice}-{number}": run for (choice, number), run in of_sequence}
 
     table = run_choices(

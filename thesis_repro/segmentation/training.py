@@ -69,6 +69,14 @@ def metrics() -> list:
     return [sm.metrics.IOUScore(threshold=0.5), sm.metrics.FScore(threshold=0.5)]
 
 
+def falling_rate(rate: float, epochs: int, batches: "Batches") -> Any:
+    """Return a learning rate for Keras that falls evenly to zero over the epochs.
+
+    It gets further in few epochs than a rate that stays.
+    """
+    return keras.optimizers.schedules.PolynomialDecay(rate, epochs * len(batches), 0.0)
+
+
 def keep_freed_memory() -> None:
     """Make the C library keep freed memory for the next batch.
 
@@ -166,8 +174,8 @@ def made_from(model: Any, batches: Batches, validation: Batches) -> dict[str, An
     """Return all that the training of a compiled model on Batches depends on, as JSON values.
 
     It is the record of the training's stage. The number of epochs is not part of it, because a
-    longer training begins like a shorter one. The loss is described by its value for a made-up
-    batch.
+    longer training begins like a shorter one (unless the learning rate falls, which the optimizer's
+    settings tell). The loss is described by its value for a made-up batch.
     Raises InputError if the model is not fresh. (`ResumableTraining` makes a stopped one so.)
     """
     if int(model.optimizer.iterations):
