@@ -1,6 +1,7 @@
 """Faults of a drawn figure: raw TeX, missing glyphs and texts that overlap."""
 
 import functools
+import gc
 import itertools
 import os
 import sys
@@ -76,6 +77,9 @@ class Watch:
         if artefacts is None or hasattr(artefacts.style.save_figure, "__wrapped__"):
             return
         style = artefacts.style
+        sys.modules["matplotlib"].rcParams["savefig.dpi"] = 50  # nobody looks at them
+        gc.freeze()  # as in conftest.py
+        gc.set_threshold(20_000)
         save_figure, show_sliders = style.save_figure, artefacts.with_sliders
 
         @functools.wraps(save_figure)

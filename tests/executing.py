@@ -54,7 +54,9 @@ def execute(folder, world):
         notebook = nbformat.read(ROOT / "notebooks" / name, 4)
         notebook.cells.append(nbformat.v4.new_code_cell(END))
         place = {"metadata": {"path": str(ROOT / "notebooks")}}
-        client = NotebookClient(notebook, kernel_name="python3", resources=place)
+        client = NotebookClient(
+            notebook, kernel_name="python3", shutdown_kernel="immediate", resources=place
+        )
         client.execute(env=variables | {"WATCHED": name[:2]})
         nbformat.write(notebook, run / "notebooks" / name)
         if name == NOTEBOOKS[0]:

@@ -81,7 +81,9 @@ def write(settings, folder, others=()):
     note = f"odometry: real KITTI frames, {lengths}; label maps by the model in the package"
     qualities = label_quality.table(runs, other_runs)
     few_folder = settings.build / "few_keypoints"
-    few_runs = few_keypoints.measure(sequences, labels, few_folder, settings.jobs)
+    few_runs = few_keypoints.measure(
+        sequences, labels, few_folder, settings.jobs, few_keypoints.REPETITIONS
+    )
     few = few_keypoints.table(few_runs)
     times = few_keypoints.time_steps(sequences[0], labels, few_folder)
     worths = worth.measure(

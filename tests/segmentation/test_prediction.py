@@ -1,15 +1,12 @@
 """Predicted label maps, model files, and the quality of label maps."""
 
-import os
-import subprocess
-import sys
-
 import cv2
 import h5py
 import keras
 import numpy as np
 import pytest
 
+from thesis_repro.command import cli
 from thesis_repro.data import cityscapes
 from thesis_repro.errors import InputError
 from thesis_repro.running import files
@@ -206,14 +203,9 @@ def test_the_shipped_model_is_as_good_on_a_tenth_of_camvid_as_recorded(camvid_re
     assert (measured.accuracy, measured.mean_iou) == pytest.approx((0.8905, 0.5982), abs=5e-4)
 
 
-def test_settings_of_another_keras_do_no_harm(small_model, frames, tmp_path):
-    command = ["predict", "--images", frames[0].parent, "--frames", 1, "--model", small_model]
-    result = subprocess.run(
-        [sys.executable, "-m", "thesis_repro", *map(str, command), "--output", tmp_path / "labels"],
-        env=os.environ | {"TF_USE_LEGACY_KERAS": "1", "KERAS_BACKEND": "jax"},
-        capture_output=True,
-        text=True,
-    )
-    assert result.returncode == 0 and result.stderr == ""
-    assert len(result.stdout.splitlines()) == 2  # what was written, and the time
+def test_the_command_writes_label_maps_and_two_lines(small_model, frames, tmp_path, capfd):
+    words = ["--images", frames[0].parent, "--frames", 1, "--model", small_model]
+    assert cli.main(["predict", *map(str, words), "--output", str(tmp_path / "labels")]) == 0
+    out, err = capfd.readouterr()
+    assert len(out.splitlines()) == 2 and err == ""  # what was written, and the time
     assert len(files.listed(tmp_path / "labels")) == 1

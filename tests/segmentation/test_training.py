@@ -49,15 +49,20 @@ def network(filters):
     return keras.Sequential(layers, name="small")
 
 
-def prepared(sets=SETS, filters=2, rate=0.01, loss=None):
-    """Return a compiled model and its batches, as notebook 4 prepares them."""
+def prepared(sets=SETS, filters=2, rate=0.01, loss=None, falls=0):
+    """Return a compiled model and its batches, as notebook 4 prepares them.
+
+    falls: number of epochs over which the learning rate falls to zero; 0: it stays.
+    """
     keras.utils.set_random_seed(0)
     model = network(filters)
     loss = training.fused_loss(loss or training.total_loss())
-    model.compile(keras.optimizers.Adam(rate), loss, metrics=training.metrics())
-    model.optimizer.build(model.trainable_variables)  # or TensorFlow compiles the step twice
     augmented = augmentation.augment_set(*sets[:2], augmentation.training_augmenter(SIZE), 0)
     batches = training.Batches([sets[:2], augmented], 4, seed=0)
+    if falls:
+        rate = training.falling_rate(rate, falls, batches)
+    model.compile(keras.optimizers.Adam(rate), loss, metrics=training.metrics())
+    model.optimizer.build(model.trainable_variables)  # or TensorFlow compiles the step twice
     return model, batches, training.Batches([sets[2:]], 4)
 
 
@@ -98,7 +103,7 @@ def train(folder, epochs=3, **options):
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
     folder = tmp_path_factory.mktemp("trained")
-    train(folder)
+    train(folder, falls=3)
     return folder
 
 
@@ -148,7 +153,7 @@ def test_each_epoch_shows_each_image_once_in_another_order():
 
 @pytest.mark.parametrize("at", [2, 12])
 def test_an_interrupted_training_goes_on_in_the_same_kernel(trained, tmp_path, at):
-    run = fit(tmp_path, interrupted=at)
+    run = fit(tmp_path, interrupted=at, falls=3)
     with pytest.raises(KeyboardInterrupt):
         run()
     assert run()["epoch"].tolist() == [1, 2, 3]
@@ -174,9 +179,22 @@ def test_early_stopping_keeps_the_best_and_stays_stopped(tmp_path):
     assert len(train(tmp_path, 40, patience=3, **options)) == stopped + 1
 
 
+def test_a_falling_rate_falls_evenly_to_zero():
+    batches = training.Batches([SETS[:2]], 4)
+    rate = training.falling_rate(0.01, 5, batches)
+    steps = np.linspace(0, 5 * len(batches), 3)
+    assert [float(rate(step)) for step in steps] == pytest.approx([0.01, 0.005, 0])
+
+
 def test_every_change_of_a_training_changes_its_record():
     records = [training.made_from(*prepared())]
-    for change in ({"rate": 0.02}, {"filters": 4}, {"loss": sm.losses.DiceLoss()}):
+    for change in (
+        {"rate": 0.02},
+        {"filters": 4},
+        {"loss": sm.losses.DiceLoss()},
+        {"falls": 3},
+        {"falls": 4},
+    ):
         records.append(training.made_from(*prepared(**change)))  # noqa: PERF401
     assert len({str(record) for record in records}) == len(records)
     assert training.made_from(*prepared()) == records[0]
@@ -210,6 +228,7 @@ def digest():
     reason="needs two cores and a system that can restrict a process to one",
 )
 def test_one_core_and_all_give_the_same_bits(digest):
+    """And settings of another Keras in the environment do no harm."""
     code = (
         "import os; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))}); "
         "import emulated; print(emulated.digest())"
@@ -219,6 +238,7 @@ def test_one_core_and_all_give_the_same_bits(digest):
         stdout=subprocess.PIPE,
         text=True,
         cwd=Path(emulated.__file__).parent,
+        env=os.environ | {"TF_USE_LEGACY_KERAS": "1", "KERAS_BACKEND": "jax"},
         check=True,
     )
     assert one_core.stdout.split()[-1] == digest
