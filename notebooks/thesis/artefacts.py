@@ -1,5 +1,6 @@
 """Where a notebook finds the files of earlier ones, and where its figures and tables go."""
 
+import gc
 from base64 import b64encode
 from collections.abc import Callable
 from pathlib import Path
@@ -9,13 +10,15 @@ import matplotlib.pyplot as plt
 import pandas as pd
 
 from thesis_repro.report import style
-from thesis_repro.running import files
+from thesis_repro.running import files, program
 from thesis_repro.running.settings import Settings, read_settings
 
 
 def begin() -> Settings:
     """Begin a notebook: set the style of the figures, and return the settings of the run."""
     style.use()
+    program.keep_freed_memory()
+    gc.freeze()  # what was imported is no garbage; not to look at it again spares time
     settings = read_settings()
     print(settings)
     return settings

@@ -1,7 +1,10 @@
 """Logs, errors in one line, and signals that stop a program."""
 
 import errno
+import platform
 import signal
+import subprocess
+import sys
 
 import pytest
 
@@ -76,3 +79,22 @@ def test_a_signal_outside_of_steps_stops_at_once():
 def test_an_ignored_signal_stays_ignored():
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     assert program.run(lambda: signal.raise_signal(signal.SIGTERM)) == 0
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other C libraries have no mallopt")
+def test_freed_memory_of_an_image_is_kept_for_the_next():
+    code = (
+        "import resource, numpy as np\n"
+        "from thesis_repro.running import program\n"
+        "{}\n"
+        "def images(): return [np.ones((376, 1241), np.uint8) for _ in range(16)]\n"
+        "for _ in range(3): images()\n"
+        "before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt\n"
+        "for _ in range(20): images()\n"
+        "print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)\n"
+    )
+    pages = [
+        int(subprocess.check_output([sys.executable, "-c", code.format(call)], text=True))
+        for call in ("", "program.keep_freed_memory()")
+    ]
+    assert pages[1] < pages[0] / 10

@@ -16,6 +16,8 @@ from tqdm import tqdm
 from thesis_repro.errors import InputError, missing_package, one_line
 
 STARTED = time.monotonic()
+# glibc's M_ARENA_MAX, M_MMAP_MAX, M_TRIM_THRESHOLD and M_TOP_PAD, as `keep_freed_memory` sets them
+MALLOC_OPTIONS = {-8: 1, -4: 0, -1: 2**31 - 1, -2: 2**28}
 log = logging.getLogger("thesis_repro")
 
 
@@ -64,6 +66,7 @@ def run(main: Callable[[], object]) -> int:
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         if signal.getsignal(number) != signal.SIG_IGN:  # as nohup has set SIGHUP
             signal.signal(number, _stop)
+    keep_freed_memory()
     try:
         return int(bool(main()))
     except KeyboardInterrupt as stop:
@@ -80,6 +83,18 @@ def run(main: Callable[[], object]) -> int:
 def run_main(main: Callable[[], object]) -> None:
     """Call the function of a program, and end the process with the status of `run`."""
     sys.exit(run(main))
+
+
+def keep_freed_memory() -> None:
+    """Make the C library keep freed memory for the next image or tensor of this process.
+
+    By default glibc requests each large one from the system anew, which fills it with zeros. That
+    takes an eighth of the time of an odometry run, and half of a training step's on a CPU. Without
+    glibc, this function does nothing.
+    """
+    with suppress(AttributeError, OSError, TypeError):  # macOS, Windows
+        for option, value in MALLOC_OPTIONS.items():
+            ctypes.CDLL(None).mallopt(option, value)
 
 
 def summary(text: str, reused: int = 0) -> None:

@@ -41,6 +41,12 @@ class Pool(NamedTuple):
             yield future.result()
 
 
+def _begin() -> None:
+    """Prepare a worker process."""
+    program.leave_ctrl_c_to_parent()
+    program.keep_freed_memory()
+
+
 @contextmanager
 def open_pool(processes: int, scheduler: str | None = None) -> Iterator[Pool]:
     """Open a pool on a Dask scheduler or, without one, on processes of this machine.
@@ -53,9 +59,7 @@ def open_pool(processes: int, scheduler: str | None = None) -> Iterator[Pool]:
         return
     if scheduler is None:
         with program.unstopped():  # not joblib's shared executor, which callers may use, too
-            executor = ProcessPoolExecutor(
-                processes, initializer=program.leave_ctrl_c_to_parent, env=ONE_THREAD
-            )
+            executor = ProcessPoolExecutor(processes, initializer=_begin, env=ONE_THREAD)
         try:
             yield Pool(processes, executor)
         except BrokenExecutor:

@@ -13,7 +13,7 @@ import tensorflow as tf
 from thesis_repro import segmentation
 from thesis_repro.data.cityscapes import read_image
 from thesis_repro.errors import InputError
-from thesis_repro.running import files, provenance
+from thesis_repro.running import files, program, provenance
 from thesis_repro.segmentation import training
 
 SIZE = 320  # height and width of written label maps, pixels
@@ -121,7 +121,7 @@ def _compiled(model: Any, scale: float) -> Callable[[np.ndarray], np.ndarray]:
     For small networks `model.predict` takes two to four times as long, because every call has a
     set-up and returns 35 probabilities a pixel.
     """
-    training.keep_freed_memory()
+    program.keep_freed_memory()
     signature = tf.TensorSpec((None, *model.input_shape[1:]), tf.uint8)
 
     @tf.function(input_signature=[signature])

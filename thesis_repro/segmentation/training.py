@@ -3,11 +3,9 @@
 A stopped training resumes from a checkpoint.
 """
 
-import ctypes
 import json
 import zlib
 from collections.abc import Callable, Collection, Iterator
-from contextlib import suppress
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -21,14 +19,12 @@ import tensorflow as tf
 from thesis_repro import segmentation
 from thesis_repro.data.cityscapes import CLASS_WEIGHTS, N_CLASSES
 from thesis_repro.errors import InputError
-from thesis_repro.running import files, provenance
+from thesis_repro.running import files, program, provenance
 from thesis_repro.segmentation import augmentation
 from thesis_repro.segmentation.exact import same_bits
 
 # files of a training: the network with the lowest validation loss, and what a training resumes from
 MODEL, HISTORY, STATE = "model.keras", "history.csv", "state.npz"
-# glibc's M_ARENA_MAX, M_MMAP_MAX, M_TRIM_THRESHOLD and M_TOP_PAD, as `keep_freed_memory` sets them
-MALLOC_OPTIONS = {-8: 1, -4: 0, -1: 2**31 - 1, -2: 2**28}
 
 
 def total_loss() -> Any:
@@ -75,18 +71,6 @@ def falling_rate(rate: float, epochs: int, batches: "Batches") -> Any:
     It gets further in few epochs than a rate that stays.
     """
     return keras.optimizers.schedules.PolynomialDecay(rate, epochs * len(batches), 0.0)
-
-
-def keep_freed_memory() -> None:
-    """Make the C library keep freed memory for the next batch.
-
-    On a CPU, TensorFlow allocates every tensor anew. By default glibc requests each large one from
-    the system, which fills it with zeros; that takes half the time of a training step. Without
-    glibc, this function does nothing.
-    """
-    with suppress(AttributeError, OSError, TypeError):  # macOS, Windows
-        for option, value in MALLOC_OPTIONS.items():
-            ctypes.CDLL(None).mallopt(option, value)
 
 
 def check_images(images: np.ndarray, shape: tuple) -> None:
@@ -235,7 +219,7 @@ class ResumableTraining(keras.callbacks.Callback):
 
     def on_train_begin(self, logs: Any = None) -> None:
         """Continue the training of the folder's checkpoint, or write the first one."""
-        keep_freed_memory()
+        program.keep_freed_memory()
         self.model.optimizer.build(self.model.trainable_variables)
         self._variables = self.model.variables + self.model.optimizer.variables
         if (self.folder / STATE).exists():
