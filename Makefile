@@ -85,7 +85,8 @@ $(foreach name,$(NAMES),$(eval $(RUN)/notebooks/$(name).ipynb: $(call imports,no
 $(RUN)/notebooks/%.ipynb: notebooks/%.ipynb $(RUN)/checked
 	@trap 'kill $$!; exit 130' INT TERM HUP; \
 	$(BIN)/jupyter nbconvert --to notebook --execute --ExecutePreprocessor.kernel_name=python3 \
-	  --ExecutePreprocessor.timeout=-1 --ExecutePreprocessor.shutdown_kernel=immediate --output-dir $(@D) --output .$* $< >$(@:.ipynb=.log) 2>&1 & wait $$! \
+	  --ExecutePreprocessor.timeout=-1 --ExecutePreprocessor.shutdown_kernel=immediate \
+	  --output-dir $(@D) --output .$* $< >$(@:.ipynb=.log) 2>&1 & wait $$! \
 	&& mv $(@D)/.$*.ipynb $@ && echo "$*: done in $$SECONDS s" \
 	|| { echo "$* failed: $$(tr -d '\033' <$(@:.ipynb=.log) | sed 's/\[[0-9;]*m//g' | grep . | tail -n 1) ($(@:.ipynb=.log))" >&2; exit 1; }
 $(RUN)/checked: FORCE  # rewritten only if the data has changed

@@ -10,7 +10,7 @@ import pandas as pd
 from thesis_repro.data import cityscapes, kitti
 
 IMAGES = 100  # most images of a domain
-LABELLED_FRAMES = 50  # about as many of all drives
+LABELLED_FRAMES = 50  # most frames of all drives together
 FRAMES = "the odometry's frames"  # the domain for which masks are made
 # a model and a domain with images that are in the model's training data
 SEEN = ("the model in the package", "KITTI's street scenes")

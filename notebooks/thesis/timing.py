@@ -56,18 +56,20 @@ def time_savings(seconds: pd.DataFrame) -> pd.Series:
     return percent_change(masked.groupby("dilation_width")["seconds"].sum(), baseline)
 
 
-def measure(sequence: Sequence, model: Any, width: int = CONTROL_WIDTH) -> pd.DataFrame:
+def measure(
+    sequence: Sequence, model: Any, width: int = CONTROL_WIDTH, frames: int = FRAMES
+) -> pd.DataFrame:
     """Time each stage of a frame, with all keypoints and with masks.
 
     Returns a table of method, stage, milliseconds (medians).
     Stages: read (the frame's file), segmentation (resize to the model's input, network, class of
     every pixel), mask (label map to 320x320, edges, dilation), detection, tracking, pose (essential
     matrix, then rotation and translation). model: a Keras model of `segmentation`. width: of the
-    masks, pixels.
+    masks, pixels. frames: number of those that are timed.
     """
     from thesis_repro.segmentation import prediction  # TensorFlow takes seconds to load
 
-    sequence = sequence.subset(WARM_UP + FRAMES)
+    sequence = sequence.subset(WARM_UP + frames)
     height, columns, channels = model.input_shape[1:]
     seconds, made = [], []
     for index in progress(range(len(sequence)), "timing"):

@@ -104,7 +104,8 @@ PROFILES = {
         epochs=12,
         patience=5,
         training_images=200,
-        # a street depends on its drive's length; with 22, 24 or 26 frames, all keypoints fail on 05
+        # A street depends on its drive's length. With 24 frames, steps of drive 05 fail even with
+        # all keypoints.
         frames=25,
         timed_frames=5,
         # the thesis has all 15; these show the same curve in less time
