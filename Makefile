@@ -22,7 +22,7 @@ help:
 	@echo "make figures     write every table and figure to figures/, from embedded data, or from KITTI=/path CITYSCAPES=/path"
 	@echo "                 (KITTI_SEMANTIC=/path: also test the label maps); size: PROFILE=smoke|lab|demo|thesis, or single:"
 	@echo "                 IMAGE_SIZE BASE_FILTERS BATCH_SIZE EPOCHS FRAMES=N|all WIDTHS=5,10|1-15 REPETITIONS; processes: JOBS"
-	@echo "make test, lint  run the tests, and every notebook with PROFILE=smoke; check format, style (Ruff) and types (mypy)"
+	@echo "make test, lint  run the tests, and every notebook with PROFILE=smoke; check style (Ruff), types (mypy), imports"
 	@echo "make torture     run the tests of kills, faults, bad input, and of the oldest and newest packages (some minutes)"
 	@echo "make lab         open copies of the notebooks in JupyterLab with PROFILE=lab (up to two minutes each);"
 	@echo "                 in a container LISTEN=0.0.0.0"
@@ -62,8 +62,8 @@ page: setup
 ifdef RUN
 code = $(shell find $(1) -name '*.py')
 LEARNING := $(call code,thesis_repro/data thesis_repro/segmentation street_world)
-PATHS := $(call code,thesis_repro/data thesis_repro/masks thesis_repro/mask_files.py thesis_repro/odometry opencv_exact)
-DRAWING := $(filter-out %/page.py %/figures.py,$(call code,thesis_repro/study thesis_repro/report notebooks/thesis))
+PATHS := $(call code,thesis_repro/data thesis_repro/masks thesis_repro/odometry opencv_exact)
+DRAWING := $(filter-out %/page.py %/figures.py,$(call code,keypoint_study notebooks/thesis))
 NAMES := $(patsubst notebooks/%.ipynb,%,$(sort $(wildcard notebooks/*.ipynb)))
 NAMES := $(if $(or $(THESIS_REPRO_CITYSCAPES),$(if $(THESIS_REPRO_KITTI),,embedded)),$(NAMES),$(filter-out 01_% 02_% 04_%,$(NAMES)))
 executed = $(patsubst %,$(RUN)/notebooks/%.ipynb,$(filter $(addsuffix _%,$(1)),$(NAMES)))
@@ -90,7 +90,7 @@ $(RUN)/notebooks/%.ipynb: notebooks/%.ipynb $(RUN)/checked
 	&& mv $(@D)/.$*.ipynb $@ && echo "$*: done in $$SECONDS s" \
 	|| { echo "$* failed: $$(tr -d '\033' <$(@:.ipynb=.log) | sed 's/\[[0-9;]*m//g' | grep . | tail -n 1) ($(@:.ipynb=.log))" >&2; exit 1; }
 $(RUN)/checked: FORCE  # rewritten only if the data has changed
-	@$(BIN)/python -m thesis_repro.checks $@
+	@$(BIN)/python -m thesis.checked $@
 # Render the drives of the embedded world and compile the shared odometry while the network is trained, to save time.
 $(call executed,05): $(if $(THESIS_REPRO_KITTI),,$(RUN)/drives)
 $(RUN)/drives: $(call executed,01)
@@ -105,7 +105,7 @@ test: setup
 torture: setup
 	@$(BIN)/python -m pytest -q -m torture
 lint: setup
-	@$(BIN)/ruff format --check --quiet . && $(BIN)/ruff check . && $(BIN)/mypy
+	@$(BIN)/ruff format --check --quiet . && $(BIN)/ruff check . && $(BIN)/mypy && $(BIN)/lint-imports --no-logo --no-cache
 # Lessons edit copies, so that the notebooks in git stay as they are. An edited copy is kept.
 LAB := $(or $(THESIS_REPRO_BUILD),build)/lab
 lab: setup

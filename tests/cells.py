@@ -2,7 +2,7 @@
 
 import json
 
-from thesis_repro.running.settings import ROOT
+from thesis.settings import ROOT
 
 NOTEBOOKS = sorted(path.name for path in (ROOT / "notebooks").glob("*.ipynb"))
 

@@ -106,11 +106,10 @@ def small_world(tmp_path_factory):
 
     Tests must not change it.
     """
-    from street_world import dataset
-    from thesis_repro.running.settings import PROFILES
+    import street_world
 
     with _shared_folder(tmp_path_factory, "small_world") as folder:  # rendered once
-        dataset.write(folder, **PROFILES["smoke"].world, seed=0, jobs=1)
+        street_world.write(folder, **street_world.SIZES["smoke"], seed=0, jobs=1)
     return folder
 
 

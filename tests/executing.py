@@ -8,7 +8,7 @@ from cells import NOTEBOOKS
 from drawn import END
 from nbclient import NotebookClient
 
-from thesis_repro.running.settings import PREFIX, ROOT
+from thesis.settings import PREFIX, ROOT
 
 # what a kernel sees of this process's variables: nothing that the Makefile sets
 KEPT = ("PATH", "HOME", "LANG", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")

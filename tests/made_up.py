@@ -6,8 +6,8 @@ import numpy as np
 import pandas as pd
 from scipy.spatial.transform import Rotation
 
-from thesis_repro.study import compare
-from thesis_repro.study.jobs import Job
+from keypoint_study import compare
+from keypoint_study.jobs import Job
 
 
 def runs(

@@ -6,11 +6,12 @@ import cv2
 import numpy as np
 import pytest
 
+from thesis import checked
 from thesis_repro import checks
 from thesis_repro.command.cli import main
 from thesis_repro.data.kitti import Sequence
-from thesis_repro.mask_files import LabelMasks, MaskFolder
 from thesis_repro.masks import MaskSettings
+from thesis_repro.masks.folders import LabelMasks, MaskFolder
 from thesis_repro.running import files
 
 IMAGES = "sequences/00/image_0"
@@ -74,7 +75,7 @@ def test_unchanged_data_is_checked_once(tiny_kitti, tmp_path, monkeypatch, capsy
         if frame is not None:
             images = tiny_kitti / IMAGES
             shutil.copy(images / "000001.png", images / f"{frame:06d}.png")
-        assert checks.main(tmp_path / "checked") == 0
+        assert checked.main(tmp_path / "checked") == 0
         assert (str(tiny_kitti) in capsys.readouterr().out) == reports
 
 

@@ -8,11 +8,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from thesis.settings import PROFILES, ROOT
 from thesis_repro.command import cli
 from thesis_repro.command.options import build_parser
 from thesis_repro.masks import KINDS
 from thesis_repro.odometry.estimators import ESTIMATORS
-from thesis_repro.running.settings import PROFILES, ROOT
 
 TEXTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 

@@ -15,10 +15,10 @@ import pandas as pd
 import pytest
 
 import thesis_repro as tr
+from keypoint_study import compare
+from keypoint_study import worth as of_worth
+from thesis.settings import ROOT
 from thesis_repro.odometry import metrics
-from thesis_repro.running.settings import ROOT
-from thesis_repro.study import compare
-from thesis_repro.study import worth as of_worth
 
 REFINED, THESIS = "refined estimator", "thesis's estimator"
 ATE, ROTATION = "aligned ATE", "rotational RPE, 1 frame"

@@ -14,8 +14,8 @@ from typing import NamedTuple
 
 import pandas as pd
 
+from thesis.settings import ROOT
 from thesis_repro.running import files
-from thesis_repro.running.settings import ROOT
 from thesis_repro.segmentation import ARITHMETIC
 
 # what thesis_repro.segmentation has set in this process
@@ -42,7 +42,10 @@ def environment(**changes):
         for name, value in os.environ.items()
         if name not in SET_BY_TESTS and not name.startswith("THESIS_REPRO_")
     }
-    variables |= {"PYTHONPATH": str(ROOT), "THESIS_REPRO_PROGRESS": os.devnull} | changes
+    variables |= {
+        "PYTHONPATH": f"{ROOT}:{ROOT}/notebooks",
+        "THESIS_REPRO_PROGRESS": os.devnull,
+    } | changes
     return {name: str(value) for name, value in variables.items() if value is not None}
 
 

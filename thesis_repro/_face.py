@@ -3,8 +3,8 @@
 # ruff: noqa: F401  they are imported for others
 
 from thesis_repro.data.kitti import Sequence
-from thesis_repro.mask_files import LabelMasks
 from thesis_repro.masks import MaskSettings, keypoint_mask
+from thesis_repro.masks.folders import LabelMasks
 from thesis_repro.odometry import (
     THESIS,
     Masks,

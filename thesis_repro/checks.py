@@ -17,10 +17,9 @@ import numpy as np
 
 from thesis_repro.data import cityscapes, kitti
 from thesis_repro.errors import InputError, one_line
-from thesis_repro.mask_files import LabelMasks, MaskFolder
 from thesis_repro.masks import coverage
-from thesis_repro.running import files, program
-from thesis_repro.running.settings import read_settings
+from thesis_repro.masks.folders import LabelMasks, MaskFolder
+from thesis_repro.running import files
 
 # Of the principal point from the middle, in frame widths and heights. KITTI has at most 0.04.
 # Frames are cropped at their upper or lower edge more often than at their sides.
@@ -125,35 +124,6 @@ def report(
     for problem in problems:
         print(f"wrong: {one_line(problem)}", file=sys.stderr)
     return not problems
-
-
-def main(path: Path) -> int:
-    """Check the data that the environment's settings name, unless it was checked before.
-
-    path: file with the names, sizes and times of the files that were checked; it is written after a
-    check without problems. Returns the exit code. Raises InputError if a file is missing.
-    """
-    settings = read_settings()
-    kitti_root = None if settings.kitti_is_embedded else settings.kitti
-    cityscapes_root = None if settings.cityscapes_is_embedded else settings.cityscapes
-    used: list[Path] = []
-    for name in kitti.sequences(kitti_root) if kitti_root else ():
-        used += kitti.Sequence(kitti_root, name).subset(settings.sizes.frames).files
-    splits = (
-        (cityscapes_root, "train"),
-        (cityscapes_root, "val"),
-        (settings.kitti_semantic, "train"),
-    )
-    for root, split in splits:
-        used += chain(*[pair[1:] for pair in cityscapes.pairs(root, split)]) if root else ()
-    lines = [f"{file} {file.stat().st_size} {file.stat().st_mtime_ns}\n" for file in used]
-    checked = ascii("".join(lines))  # names may hold any bytes
-    if path.is_file() and path.read_text(encoding="utf-8") == checked:
-        return 0
-    if not report(kitti_root, cityscapes_root, settings.kitti_semantic):
-        return 1
-    files.write_text(path, checked)
-    return 0
 
 
 # Warnings, one line each: "place: what is wrong"
@@ -280,7 +250,3 @@ def _class_shares(source: LabelMasks) -> np.ndarray:
     label_maps = [source.label_map(index).ravel() for index in _sampled(source)]
     counts = np.bincount(np.concatenate(label_maps), minlength=cityscapes.N_CLASSES)
     return counts / counts.sum()
-
-
-if __name__ == "__main__":
-    program.run_main(lambda: main(Path(sys.argv[1])))

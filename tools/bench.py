@@ -24,16 +24,17 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from thesis_repro import mask_files, masks, odometry
+from keypoint_study import controls, methods
+from keypoint_study.sources import Source
+from thesis.settings import ROOT
+from thesis_repro import masks, odometry
 from thesis_repro.data.kitti import Sequence
+from thesis_repro.masks import folders
 from thesis_repro.odometry import THESIS, Odometry, loop
 from thesis_repro.odometry.estimators import refined
 from thesis_repro.running import program
 from thesis_repro.running.files import write_text
-from thesis_repro.running.settings import ROOT
 from thesis_repro.segmentation import prediction
-from thesis_repro.study import controls, methods
-from thesis_repro.study.sources import Source
 
 FRAMES = 40  # from the sequence's start
 REPEATS = 3
@@ -127,8 +128,8 @@ def mask_cost(sequence, labels):
         if method != "true-labels"
     ]
     for index in range(len(sequence)):
-        for column, forget in enumerate((lambda: None, mask_files.forget_edges)):
-            mask_files.forget_edges()
+        for column, forget in enumerate((lambda: None, folders.forget_edges)):
+            folders.forget_edges()
             for kind in kinds:
                 forget()
                 costs[column] += seconds(lambda: kind[index], time.process_time)  # noqa: B023

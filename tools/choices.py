@@ -9,13 +9,13 @@ from itertools import product
 import numpy as np
 import pandas as pd
 
+from keypoint_study import compare, methods
+from keypoint_study.jobs import CONTROL_WIDTH, ESTIMATORS
+from keypoint_study.report import texts
+from keypoint_study.report.worth import cell
+from keypoint_study.worth import DECIDING, NUMBERS, SPLIT, typical
 from thesis import few_keypoints
 from thesis_repro.odometry.estimators import COMPARED
-from thesis_repro.report import texts
-from thesis_repro.report.worth import cell
-from thesis_repro.study import compare, methods
-from thesis_repro.study.jobs import CONTROL_WIDTH, ESTIMATORS
-from thesis_repro.study.worth import DECIDING, NUMBERS, SPLIT, typical
 
 LEFT_OUT = "01"  # the street without which everything is said a second time
 # choices of the curve of few keypoints, as few_keypoints names them

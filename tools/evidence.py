@@ -19,18 +19,19 @@ import label_quality
 import reasons
 import refined_widths
 import saturation
+from keypoint_study import jobs, runner, worth
+from keypoint_study.report import style, texts
+from keypoint_study.report import worth as report_worth
+from keypoint_study.sources import Source, named
 from thesis import few_keypoints
-from thesis_repro import mask_files, masks
+from thesis.settings import ROOT, read_settings
+from thesis_repro import masks
 from thesis_repro.data import kitti
 from thesis_repro.errors import InputError
+from thesis_repro.masks import folders
 from thesis_repro.odometry import metrics
-from thesis_repro.report import style, texts
-from thesis_repro.report import worth as report_worth
 from thesis_repro.running import program, provenance
 from thesis_repro.running.files import needed, write_text
-from thesis_repro.running.settings import ROOT, read_settings
-from thesis_repro.study import jobs, runner, worth
-from thesis_repro.study.sources import Source, named
 
 FOLDER = ROOT / "figures" / "kitti_excerpts"
 # Figures and tables of notebooks 8 and 9. Other notebooks draw frames, which are not ours to give.
@@ -73,7 +74,7 @@ def write(settings, folder, others=()):
     runs = _read(settings, "runs")
     other_runs = _other_runs(settings, sequences, others)
     label_masks = [
-        mask_files.LabelMasks(labels / sequence.name, sequence, jobs.CONTROL_WIDTH)
+        folders.LabelMasks(labels / sequence.name, sequence, jobs.CONTROL_WIDTH)
         for sequence in sequences
     ]
     steps = pd.concat(map(failures.measure, sequences, label_masks), ignore_index=True)
@@ -173,7 +174,7 @@ def _other_runs(settings, sequences, others):
         covered = [
             each.name
             for each in sequences
-            if mask_files.folder_of_sequence(source.folder, each.name).is_dir()
+            if folders.folder_of_sequence(source.folder, each.name).is_dir()
         ]
         if not covered:
             wanted = ", ".join(each.name for each in sequences)

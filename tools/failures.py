@@ -10,10 +10,10 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 
+from keypoint_study.report import style
 from thesis_repro.odometry import THESIS, Matches, Odometry, metrics, scales
 from thesis_repro.odometry.estimators import refined
 from thesis_repro.odometry.refined.fit import SUPPORT_THRESHOLDS, near, with_uncertainty
-from thesis_repro.report import style
 
 SETTINGS = replace(THESIS, estimator=refined)
 KINDS = {"all": ("all keypoints", style.BASELINE), "masks": ("masks", style.MASKED)}

@@ -7,9 +7,9 @@ import re
 
 import pandas as pd
 
-from thesis_repro.report import style, texts
-from thesis_repro.running.settings import ROOT
-from thesis_repro.study import compare
+from keypoint_study import compare
+from keypoint_study.report import style, texts
+from thesis.settings import ROOT
 
 CARD = ROOT / "thesis_repro/segmentation/weights/README.md"  # of the model in the package
 REAL, RENDERED = "real frames", "embedded world (rendered)"

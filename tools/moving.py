@@ -17,16 +17,16 @@ import cv2
 import numpy as np
 import pandas as pd
 
+from keypoint_study import compare, jobs, runner
+from keypoint_study.report import style, texts
+from keypoint_study.sources import Source
+from thesis.settings import ROOT, cores
 from thesis_repro import masks
 from thesis_repro.data import kitti
 from thesis_repro.data.cityscapes import ID, read_label_map
 from thesis_repro.errors import InputError
 from thesis_repro.odometry.loop import detect, track
-from thesis_repro.report import style, texts
 from thesis_repro.running import program
-from thesis_repro.running.settings import ROOT, cores
-from thesis_repro.study import compare, jobs, runner
-from thesis_repro.study.sources import Source
 
 sys.path.append(str(ROOT / "notebooks"))
 

@@ -8,10 +8,10 @@ import subprocess
 import tempfile
 from pathlib import Path
 
+from thesis.settings import ROOT
 from thesis_repro.errors import InputError
 from thesis_repro.running import program
 from thesis_repro.running.files import write_text
-from thesis_repro.running.settings import ROOT
 
 PINS = ROOT / "environment.txt"
 HEADING = "# What those need:\n"

@@ -8,13 +8,13 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
+from keypoint_study import compare, worth
+from keypoint_study.report import style, texts
 from thesis_repro.odometry import Matches, scales
 from thesis_repro.odometry.metrics import MIN_DIRECTED_STEP
 from thesis_repro.odometry.refined.fit import near
 from thesis_repro.odometry.sharing import SharedCalls
-from thesis_repro.report import style, texts
 from thesis_repro.running.files import progress
-from thesis_repro.study import compare, worth
 
 EVERY = 12  # frames
 # choices with a name in the figure, few enough for it; the others are plain dots

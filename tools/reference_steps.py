@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 
 from thesis_repro.data.kitti import Sequence
-from thesis_repro.mask_files import MaskFolder
+from thesis_repro.masks.folders import MaskFolder
 from thesis_repro.odometry import THESIS, Odometry, run_many, scales
 from thesis_repro.odometry.estimators import refined
 from thesis_repro.odometry.loop import normalise

@@ -6,8 +6,8 @@ Shuffled points hardly change the refined estimator, so one run is enough.
 import pandas as pd
 
 import choices
-from thesis_repro.study import compare, runner
-from thesis_repro.study.jobs import Job
+from keypoint_study import compare, runner
+from keypoint_study.jobs import Job
 
 
 def measure(sequences, labels, widths, folder, processes=1) -> pd.DataFrame:

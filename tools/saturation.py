@@ -14,9 +14,9 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from thesis_repro.report import style
-from thesis_repro.report.worth import SHOWN, table_of
-from thesis_repro.study.worth import DECIDING, MOTIONS, SPLIT, typical
+from keypoint_study.report import style
+from keypoint_study.report.worth import SHOWN, table_of
+from keypoint_study.worth import DECIDING, MOTIONS, SPLIT, typical
 
 REFERENCE = DECIDING  # random keypoints
 CURVES = {

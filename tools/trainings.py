@@ -19,13 +19,14 @@ import numpy as np
 import pandas as pd
 import tensorflow as tf
 
+from keypoint_study import compare, jobs, runner
+from keypoint_study.sources import Source
+from thesis.settings import ROOT, read_settings
 from thesis_repro.data import cityscapes, kitti
+from thesis_repro.masks import WIDTHS
 from thesis_repro.running import files, program, provenance, workers
-from thesis_repro.running.settings import ALL_WIDTHS, ROOT, read_settings
 from thesis_repro.segmentation import prediction, quality, training
 from thesis_repro.segmentation.unet import build_unet
-from thesis_repro.study import compare, jobs, runner
-from thesis_repro.study.sources import Source
 
 sys.path.append(str(ROOT / "notebooks"))
 
@@ -108,7 +109,7 @@ def run(settings, sources):
     folder = settings.build / "trainings/odometry"
     first = jobs.first_jobs(
         sequences,
-        {"thesis": ALL_WIDTHS, DECIDING: []},
+        {"thesis": WIDTHS, DECIDING: []},
         tested=jobs.CONTROL_WIDTH,
         sources=sources,
         repetitions=repetitions,

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from thesis_repro.report import texts
+from keypoint_study.report import texts
 
 # the templates here are found beside those of the package
 texts.LOADER.searchpath.append(str(Path(__file__).parent / "templates"))

@@ -15,17 +15,17 @@ import cv2
 import numpy as np
 import pandas as pd
 
+from keypoint_study.jobs import CONTROL_WIDTH, Job
+from keypoint_study.methods import Choice
+from keypoint_study.runner import Run, run_all, run_poses
 from thesis_repro import masks
 from thesis_repro.data.cityscapes import ID, read_label_map, resize_bilinear
 from thesis_repro.data.kitti import Sequence
-from thesis_repro.mask_files import LabelMasks
 from thesis_repro.masks import MaskSettings
+from thesis_repro.masks.folders import LabelMasks
 from thesis_repro.odometry import THESIS, keypoints, metrics
 from thesis_repro.odometry.loop import detect, normalise, track
 from thesis_repro.running import provenance
-from thesis_repro.study.jobs import CONTROL_WIDTH, Job
-from thesis_repro.study.methods import Choice
-from thesis_repro.study.runner import Run, run_all, run_poses
 
 ESTIMATORS = ("thesis", "inliers", "refined")  # a new one is compared when it is named here
 VEGETATION = (ID["vegetation"], ID["terrain"])

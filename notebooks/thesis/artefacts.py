@@ -9,9 +9,9 @@ from typing import Any
 import matplotlib.pyplot as plt
 import pandas as pd
 
-from thesis_repro.report import style
+from keypoint_study.report import style
+from thesis.settings import Settings, read_settings
 from thesis_repro.running import files, program
-from thesis_repro.running.settings import Settings, read_settings
 
 
 def begin() -> Settings:

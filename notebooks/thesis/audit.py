@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from thesis_repro.study import compare
+from keypoint_study import compare
 
 ROWS = json.loads((Path(__file__).parent / "audit.json").read_text(encoding="utf-8"))["rows"]
 METRICS = {  # column of a table: its name in the audit

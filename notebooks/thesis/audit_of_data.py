@@ -12,17 +12,17 @@ import numpy as np
 import pandas as pd
 from cv2 import INTER_NEAREST, resize
 
+from keypoint_study.jobs import CONTROL_WIDTH
+from keypoint_study.methods import METHODS
+from keypoint_study.sources import Source
 from thesis import ablations, artefacts, audit_of_tables, domain_gap, timing
 from thesis.audit import measurement
+from thesis.settings import Settings
 from thesis_repro.data import cityscapes
 from thesis_repro.data.cityscapes import ID, read_label_map
 from thesis_repro.data.kitti import TRUE_LABELS, Sequence
-from thesis_repro.mask_files import LabelMasks
-from thesis_repro.running.settings import Settings
+from thesis_repro.masks.folders import LabelMasks
 from thesis_repro.segmentation import augmentation, training
-from thesis_repro.study.jobs import CONTROL_WIDTH
-from thesis_repro.study.methods import METHODS
-from thesis_repro.study.sources import Source
 
 SMALL = [ID[name] for name in ("pole", "traffic light", "traffic sign", "person")]
 SHADOW = (

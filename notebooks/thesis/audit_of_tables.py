@@ -11,11 +11,11 @@ from typing import Any
 import pandas as pd
 from scipy.stats import binomtest
 
+from keypoint_study import compare
 from thesis import section_4_2
 from thesis.audit import METRICS, measurement, ratio, share
 from thesis.captions import REPORTED
 from thesis_repro.data.cityscapes import LABELS
-from thesis_repro.study import compare
 
 # the thesis's changes in percent, one row a sequence
 CHANGES = pd.DataFrame(

@@ -10,7 +10,7 @@ and here (for this run's numbers).
 import json
 from pathlib import Path
 
-from thesis_repro.report import html
+from keypoint_study.report import html
 
 _HERE = Path(__file__).parent
 REPORTED = json.loads((_HERE / "reported.json").read_text(encoding="utf-8"))

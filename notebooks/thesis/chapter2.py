@@ -12,9 +12,9 @@ from matplotlib.collections import LineCollection
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 
+from keypoint_study.report import style
+from keypoint_study.report.style import BLUE, GREEN, KEYPOINT, ORANGE, RED, SKY
 from thesis_repro.odometry import metrics
-from thesis_repro.report import style
-from thesis_repro.report.style import BLUE, GREEN, KEYPOINT, ORANGE, RED, SKY
 
 
 def figure_2_02(

@@ -6,11 +6,11 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 
+from keypoint_study.report import style
+from keypoint_study.report.style import BLUE, ORANGE, RED, SKY
 from thesis import frames
 from thesis_repro.data import cityscapes
 from thesis_repro.masks import dilate
-from thesis_repro.report import style
-from thesis_repro.report.style import BLUE, ORANGE, RED, SKY
 
 
 def figure_3_02(

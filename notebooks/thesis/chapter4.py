@@ -1,6 +1,6 @@
 """Figures 4.4 to 4.16: single frames, paths, and errors in metres.
 
-`thesis_repro.report.comparison` shows ratios of errors.
+`keypoint_study.report.comparison` shows ratios of errors.
 
 Runs are rows of the table of `runner.run_jobs`. Lines and bars show the mean over repetitions, or
 the only run. Bands and error bars go from the lowest to the highest repetition.
@@ -17,10 +17,9 @@ from matplotlib.container import BarContainer
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from thesis import frames
-from thesis.flicker import View
-from thesis_repro.report import style
-from thesis_repro.report.style import (
+from keypoint_study import compare
+from keypoint_study.report import style
+from keypoint_study.report.style import (
     BASELINE,
     EDGE_COLOR,
     KEYPOINT,
@@ -30,7 +29,8 @@ from thesis_repro.report.style import (
     REDUCED,
     TRUTH,
 )
-from thesis_repro.study import compare
+from thesis import frames
+from thesis.flicker import View
 
 METHODS = {
     "baseline": ("all keypoints", BASELINE),

@@ -8,8 +8,8 @@ from matplotlib.colors import to_rgba_array
 from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 
+from keypoint_study.report import style
 from thesis.chapter2 import show_numbers
-from thesis_repro.report import style
 
 
 def figure_2_01() -> plt.Figure:

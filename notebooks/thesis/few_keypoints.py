@@ -31,17 +31,17 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
+from keypoint_study import compare, jobs
+from keypoint_study.jobs import CONTROL_WIDTH
+from keypoint_study.report import style, texts
+from keypoint_study.worth import FILL
 from thesis.ablations import FunctionMasks, random_keypoints, run_choices
 from thesis_repro import odometry
 from thesis_repro.data.kitti import Sequence
-from thesis_repro.mask_files import LabelMasks
+from thesis_repro.masks.folders import LabelMasks
 from thesis_repro.odometry import THESIS
 from thesis_repro.odometry.keypoints import filled, spread
-from thesis_repro.report import style, texts
 from thesis_repro.running import provenance
-from thesis_repro.study import compare, jobs
-from thesis_repro.study.jobs import CONTROL_WIDTH
-from thesis_repro.study.worth import FILL
 
 ESTIMATORS = {name: jobs.ESTIMATORS[name] for name in ("thesis", "refined")}  # of rule 4
 NUMBERS = (50, 100, 200, 400, 800)

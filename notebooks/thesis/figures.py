@@ -9,8 +9,8 @@ import subprocess
 import sys
 
 from thesis import page, trainings
+from thesis.settings import ROOT, Settings, read_settings
 from thesis_repro.running import program, provenance
-from thesis_repro.running.settings import ROOT, Settings, read_settings
 
 
 def main() -> int:

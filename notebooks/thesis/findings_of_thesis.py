@@ -4,12 +4,12 @@ from typing import Any
 
 import pandas as pd
 
+from keypoint_study import compare
+from keypoint_study.jobs import CONTROL_WIDTH
+from keypoint_study.report import findings, style, texts
 from thesis import domain_gap, section_4_2, trainings
-from thesis_repro.report import findings, style, texts
+from thesis.settings import Settings
 from thesis_repro.running.files import write_text
-from thesis_repro.running.settings import Settings
-from thesis_repro.study import compare
-from thesis_repro.study.jobs import CONTROL_WIDTH
 
 
 def notes(settings: Settings, runs: pd.DataFrame, mask_settings: dict[str, Any]) -> tuple[str, str]:

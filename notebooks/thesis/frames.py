@@ -7,9 +7,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.ticker import MaxNLocator
 
+from keypoint_study.report import style
+from keypoint_study.report.style import GREEN, RED
 from thesis_repro.masks import dilate
-from thesis_repro.report import style
-from thesis_repro.report.style import GREEN, RED
 
 
 def pictures(

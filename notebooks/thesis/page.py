@@ -21,11 +21,11 @@ from urllib.parse import quote
 import pandas as pd
 from markupsafe import Markup
 
+from keypoint_study.report import html, texts
 from thesis import captions, timing
-from thesis_repro.report import html, texts
+from thesis.settings import ROOT, Settings, read_settings
 from thesis_repro.running import program, provenance
 from thesis_repro.running.files import atomic, listed, write_text
-from thesis_repro.running.settings import ROOT, Settings, read_settings
 
 GALLERY = "README.md"
 REAL = "kitti_excerpts"  # folder of the evidence on real frames (tools/evidence.py)

@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from thesis.captions import REPORTED
-from thesis_repro.study import compare
-from thesis_repro.study.best_width import (
+from keypoint_study import compare
+from keypoint_study.best_width import (
     best_widths,
     changes,
     chosen_widths,
@@ -21,8 +20,9 @@ from thesis_repro.study.best_width import (
     percent_change,
     stability,
 )
-from thesis_repro.study.jobs import Job, repeated
-from thesis_repro.study.methods import AS_SLAM_SYSTEMS
+from keypoint_study.jobs import Job, repeated
+from keypoint_study.methods import AS_SLAM_SYSTEMS
+from thesis.captions import REPORTED
 
 __all__ = [
     "best_widths",

@@ -15,14 +15,15 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from thesis_repro import mask_files, masks, odometry
+from keypoint_study.best_width import percent_change
+from keypoint_study.jobs import CONTROL_WIDTH
+from thesis.settings import Settings, cores
+from thesis_repro import masks, odometry
 from thesis_repro.data.cityscapes import resize_bilinear
 from thesis_repro.data.kitti import Sequence
+from thesis_repro.masks import folders
 from thesis_repro.odometry.runs import Masks
 from thesis_repro.running.files import progress, write_text
-from thesis_repro.running.settings import Settings, cores
-from thesis_repro.study.best_width import percent_change
-from thesis_repro.study.jobs import CONTROL_WIDTH
 
 TURNS = 2  # of each run, of which the fastest counts
 FRAMES = 20  # on which the stages are timed
@@ -38,7 +39,7 @@ def seconds_of(sequence: Sequence, masks: Masks | None = None) -> float:
     cv2.setNumThreads(1)
     seconds = []
     for _ in range(TURNS):
-        mask_files.forget_edges()  # which the run before has found
+        folders.forget_edges()  # which the run before has found
         frames = odometry.run(sequence, masks=masks).frames
         seconds.append(frames.filter(like="_seconds")[2:].to_numpy().sum())
     cv2.setNumThreads(-1)  # as many as there are cores

@@ -5,10 +5,10 @@
 
 import pandas as pd
 
+from keypoint_study import compare, jobs
+from thesis.settings import ROOT, Settings
 from thesis_repro.running import provenance
 from thesis_repro.running.files import listed
-from thesis_repro.running.settings import ROOT, Settings
-from thesis_repro.study import compare, jobs
 
 TABLE = ROOT / "figures" / "trainings.csv"
 NUMBERS = {  # columns of the table: their names in `summary`

@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from thesis_repro import mask_files, odometry
+from thesis_repro import odometry
 from thesis_repro.command.cli import main
 from thesis_repro.data import kitti, label_ids
 from thesis_repro.data.cityscapes import COLORS, ID, LABELS, TRAINED
 from thesis_repro.data.trajectories import read_poses, write_tum
 from thesis_repro.errors import InputError
+from thesis_repro.masks import folders
 
 
 @pytest.fixture
@@ -374,8 +375,8 @@ BINARY[:36, 8:-8] = 255
 def test_masks_of_other_tools(tmp_path, name, pixels):
     data = cv2.imencode(name[1:].lower(), pixels)[1]
     (tmp_path / name).write_bytes(data.tobytes())
-    path = mask_files._images_by_name(tmp_path)["a.png"]
-    assert path.name == name and np.array_equal(mask_files.read_mask(path), BINARY)
+    path = folders._images_by_name(tmp_path)["a.png"]
+    assert path.name == name and np.array_equal(folders.read_mask(path), BINARY)
 
 
 def test_what_is_no_mask_is_named(tmp_path):
@@ -387,10 +388,10 @@ def test_what_is_no_mask_is_named(tmp_path):
     ):
         cv2.imwrite(str(tmp_path / "a.png"), pixels)
         with pytest.raises(InputError, match=f"a.png: .*{text}"):
-            mask_files.read_mask(tmp_path / "a.png")
+            folders.read_mask(tmp_path / "a.png")
     (tmp_path / "a.png").write_bytes(b"no picture")
     with pytest.raises(InputError, match="a.png: "):
-        mask_files.read_mask(tmp_path / "a.png")
+        folders.read_mask(tmp_path / "a.png")
 
 
 def picture_frames(own, hidden, alpha):

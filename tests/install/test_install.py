@@ -14,8 +14,8 @@ from packaging.requirements import Requirement
 from trials import refused, run, snapshot, succeed
 
 import can_install
+from thesis.settings import ROOT
 from thesis_repro.running import provenance
-from thesis_repro.running.settings import ROOT
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 UV = Path(sys.executable).with_name("uv")
@@ -42,7 +42,7 @@ def uv(*words):
 def wheel(tmp_path_factory):
     """It is built from a copy, because building leaves files beside what it is built from."""
     folder = tmp_path_factory.mktemp("source")
-    for name in ("thesis_repro", "street_world", "opencv_exact"):
+    for name in ("thesis_repro", "keypoint_study", "street_world", "opencv_exact"):
         shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
     for name in ("pyproject.toml", "LICENSE"):
         shutil.copy(ROOT / name, folder)
@@ -114,7 +114,7 @@ def test_a_type_checker_sees_the_types_of_the_main_names(tmp_path):
 
 def plan(root, *options, **changes):
     """What `make notebooks` would execute in a run's folder, from its output."""
-    where = succeed([sys.executable, "-m", "thesis_repro.running.settings"], root, **changes)
+    where = succeed([sys.executable, "-m", "thesis.settings"], root, **changes)
     words = ["make", "-n", "-o", ".venv/ready", "notebooks", f"RUN={where.stdout.strip()}"]
     return succeed([*words, *options], root, **changes).stdout
 
@@ -124,7 +124,14 @@ def checkout(tmp_path):
     """A folder with the Makefile, and an environment that make takes for its own."""
     for name in ("Makefile", "environment.txt", "pyproject.toml"):
         shutil.copy(ROOT / name, tmp_path)
-    for name in ("thesis_repro", "street_world", "opencv_exact", "notebooks", "tools"):
+    for name in (
+        "thesis_repro",
+        "keypoint_study",
+        "street_world",
+        "opencv_exact",
+        "notebooks",
+        "tools",
+    ):
         (tmp_path / name).symlink_to(ROOT / name)
     (tmp_path / ".venv").symlink_to(sys.prefix)
     return tmp_path

@@ -8,8 +8,8 @@ import json
 import pytest
 from cells import cells, named
 
+from thesis.settings import PREFIX, read_settings
 from thesis_repro.errors import InputError
-from thesis_repro.running.settings import PREFIX, read_settings
 
 # the cells that an edit goes through, without those that only show something
 MASKS = ["01", "02", "03", "05", "06", "52", "12", "13", "45", "46", "54", "48"]

@@ -11,7 +11,7 @@ from cells import NOTEBOOKS, named
 from executing import run_of
 
 from thesis import page
-from thesis_repro.running.settings import PREFIX, ROOT, read_settings
+from thesis.settings import PREFIX, ROOT, read_settings
 
 pytestmark = pytest.mark.notebooks
 FIGURES = [
@@ -93,7 +93,7 @@ def test_the_page_shows_every_artefact(executed):
     [
         (f"notebooks/{named('06')}", {"06", "07", "08", "09"}),
         (f"notebooks/{named('07')}", {"07"}),
-        ("thesis_repro/mask_files.py", {"05", "06", "07", "08", "09"}),
+        ("thesis_repro/masks/folders.py", {"05", "06", "07", "08", "09"}),
         ("street_world/street.py", {name[:2] for name in NOTEBOOKS}),
         ("notebooks/thesis/domain_gap.py", {"05", "06", "07", "08", "09"}),
         ("notebooks/thesis/page.py", set()),

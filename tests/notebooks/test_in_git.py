@@ -10,7 +10,7 @@ import nbformat
 import pytest
 from cells import NOTEBOOKS, cells
 
-from thesis_repro.running.settings import ROOT
+from thesis.settings import ROOT
 
 LOOP = "def path_by_hand("  # the one cell that may be longer
 # functions, classes and notebook commands in the listings of each section of the appendix

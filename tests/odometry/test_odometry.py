@@ -15,7 +15,7 @@ from reference_steps import estimated, matched_points
 from thesis_repro import odometry
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
-from thesis_repro.mask_files import MaskFolder
+from thesis_repro.masks.folders import MaskFolder
 from thesis_repro.odometry import (
     OPENCV,
     THESIS,

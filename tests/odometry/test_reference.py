@@ -15,7 +15,7 @@ import opencv_exact
 import thesis_repro
 from reference_steps import ESTIMATORS, FOLDER, STEPS, digest
 from thesis_repro.data.kitti import Sequence
-from thesis_repro.mask_files import MaskFolder
+from thesis_repro.masks.folders import MaskFolder
 from thesis_repro.odometry import THESIS, Matches, metrics
 from thesis_repro.odometry.loop import VoteOfAll, normalise
 from thesis_repro.odometry.refined import RefinedEstimator

@@ -12,6 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from trials import contents
 
+import street_world
 from street_world import dataset, drives, raster, street, textures
 from street_world.things import Faces
 from thesis import ablations
@@ -19,11 +20,10 @@ from thesis_repro.data import cityscapes, kitti
 from thesis_repro.data.cityscapes import ID
 from thesis_repro.errors import InputError
 from thesis_repro.odometry import OPENCV, THESIS
-from thesis_repro.running.settings import PROFILES
 
 pytestmark = pytest.mark.slow
 
-SMALL = PROFILES["smoke"].world | {"scale": 0.2, "jobs": 1}
+SMALL = street_world.SIZES["smoke"] | {"scale": 0.2, "jobs": 1}
 
 
 @pytest.fixture(scope="module")

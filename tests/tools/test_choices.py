@@ -4,9 +4,9 @@ import made_up
 import pandas as pd
 
 import choices
+from keypoint_study import jobs
+from keypoint_study.jobs import ESTIMATORS
 from thesis_repro.odometry.estimators import COMPARED
-from thesis_repro.study import jobs
-from thesis_repro.study.jobs import ESTIMATORS
 
 
 def test_one_standard_counts_streets_and_asks_rule_5_of_every_choice():

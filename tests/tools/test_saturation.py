@@ -8,7 +8,7 @@ import pandas as pd
 import reasons
 import refined_widths
 import saturation
-from thesis_repro.study import worth
+from keypoint_study import worth
 
 STREETS = [f"{number:02d}" for number in range(8)]
 

@@ -11,11 +11,11 @@ import bench
 import evidence
 import moving
 import train_shipped
+from keypoint_study import compare
+from keypoint_study.sources import Source
+from thesis.settings import read_settings
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
-from thesis_repro.running.settings import read_settings
-from thesis_repro.study import compare
-from thesis_repro.study.sources import Source
 
 pytestmark = pytest.mark.slow
 

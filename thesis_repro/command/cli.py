@@ -14,7 +14,6 @@ from typing import Any
 from thesis_repro.command.options import MASK_OPTIONS, build_parser
 from thesis_repro.errors import InputError, one_line
 from thesis_repro.running import program
-from thesis_repro.running.settings import ALL_WIDTHS, PROFILES, SEED
 
 # options that name an output file: its content, and the endings that its name may have (none given:
 # any)
@@ -33,7 +32,7 @@ def synthesize(options: Any) -> None:
     """Write the embedded world, a rendered street, in the layouts of KITTI and Cityscapes."""
     import street_world
 
-    new, total = street_world.write(options.out, **PROFILES[options.profile].world, seed=SEED)
+    new, total = street_world.write(options.out, **street_world.SIZES[options.profile])
     program.summary(
         f"{options.out}: kitti and cityscapes of the embedded world, profile {options.profile}, "
         f"{total:,} images with their label maps",
@@ -80,7 +79,7 @@ def masks(options: Any) -> None:
 
     Masks are 8-bit PNG images: 255 keeps keypoints, 0 ignores them.
     """
-    from thesis_repro.mask_files import write_masks
+    from thesis_repro.masks.folders import write_masks
 
     sequence = _sequence(options)
     label_masks = _masks(options, sequence)
@@ -122,7 +121,7 @@ def odometry(options: Any) -> None:
         _warn([f"{sequence.poses_path}: {reason}"] * bool(reason))
     record = _record(result, sequence)
     if options.plot:
-        from thesis_repro.report import paths, style
+        from keypoint_study.report import paths, style
 
         truth, poses = None, result.poses
         if sequence.has_truth:
@@ -131,23 +130,19 @@ def odometry(options: Any) -> None:
         with style.applied():
             drawing = paths.figure({"estimate": poses}, truth, f"sequence {sequence.name}")
             style.write_figure(drawing, options.plot)
-    _print(
-        options,
-        record,
-        "run.txt.j2",
-        sequence=sequence,
-        speed=options.speed,
-        length=metrics.RELATIVE_LENGTH,
-    )
+    print(json.dumps(record) if options.json else _text(record, sequence, options.speed))
+    for name, path in _output_files(options).items():
+        program.log.info(f"{path}: {OUTPUT_FILES[name][0]}")
 
 
 def study(options: Any) -> int:
     """Compare your own masks, keypoints or paths with all keypoints and with controls."""
+    from keypoint_study import sources
+    from keypoint_study.plan import Study
     from thesis_repro import checks
     from thesis_repro.data import kitti, layout
+    from thesis_repro.masks import WIDTHS
     from thesis_repro.running import provenance
-    from thesis_repro.study import sources
-    from thesis_repro.study.plan import Study
 
     if not options.sources:
         raise InputError(
@@ -163,7 +158,7 @@ def study(options: Any) -> int:
         raise InputError("--invert: needs --masks DIR")
     widths: set[int] = set()
     if has_labels:
-        all_widths = ALL_WIDTHS if mask_settings.has_width else ()
+        all_widths = WIDTHS if mask_settings.has_width else ()
         widths = widths.union(*options.widths or [all_widths])
     names = dict.fromkeys(layout.locate(options.kitti, name)[1].name for name in options.sequences)
     planned = Study(
@@ -183,7 +178,7 @@ def study(options: Any) -> int:
     folder = options.folder.absolute()
     _check_outputs(options, *(source.folder for source in planned.sources))
     # this import takes seconds, so the input is checked first
-    from thesis_repro.report import study_report
+    from keypoint_study.report import study_report
 
     with provenance.claimed(folder):
         warnings = []
@@ -255,6 +250,36 @@ def _record(result: Any, sequence: Any) -> dict[str, Any]:
         "ms_per_frame": 1000 * float(seconds.mean()),
         "flagged": {flag: int(count) for flag, count in result.flagged.items()},
     }
+
+
+def _text(record: dict[str, Any], sequence: Any, speed: float | None) -> str:
+    """Return what `odometry` prints of a run. speed: assumed without ground truth, m/s."""
+    from thesis_repro.odometry.metrics import RELATIVE_LENGTH
+
+    def shown(name: str, form: str) -> str:
+        return "none (too short or straight)" if record[name] is None else form % record[name]
+
+    lines = [f"sequence {one_line(sequence.name)}, {len(sequence)} frames"]
+    if sequence.has_truth:
+        per_100m = shown("relative_rotation_deg_per_100m", "%.3f")
+        lines += [
+            f"RMSE            {record['rmse_m']:.6f} m",
+            f"MAE             {record['mae_m']:.6f} m",
+            f"ATE, aligned    {shown('ate_se3_m', '%.6f')} m",
+            f"over {RELATIVE_LENGTH:g} m       {shown('relative_translation_percent', '%.3f')} %, "
+            f"{per_100m} deg/100 m",
+        ]
+    else:
+        steps = "1 m a frame" if speed is None else f"{speed:g} m/s"
+        lines.append(
+            f"no ground truth to compare with ({one_line(sequence.poses_path)} does not exist); "
+            f"assumed steps: {steps}"
+        )
+    lines.append(f"mean keypoints  {record['mean_keypoints']:.1f}")
+    lines.append(f"time a frame    {record['ms_per_frame']:.1f} ms")
+    for flag, count in record["flagged"].items():
+        lines.append(f"flagged         {count} frame{'s' if count > 1 else ''}: {flag}")
+    return "\n".join(lines)
 
 
 def _detector(options: Any) -> Any:
@@ -349,7 +374,7 @@ def _mask_settings(options: Any, has_labels: bool = True) -> Any:
 
 def _masks(options: Any, sequence: Any) -> Any:
     """The masks that --masks or --labels name, or None."""
-    from thesis_repro.mask_files import LabelMasks, MaskFolder
+    from thesis_repro.masks.folders import LabelMasks, MaskFolder
 
     settings = _mask_settings(options, options.labels)
     ready_made = vars(options).get("masks")
@@ -392,18 +417,6 @@ def _check_outputs(options: Any, *inputs: Path | None) -> None:
                 raise InputError(
                     f"{path}: lies in {folder}, which is only read; name another place"
                 )
-
-
-def _print(options: Any, record: Any, template: str, **values: Any) -> None:
-    """Print a result as JSON or with a template, and name the written files on standard error."""
-    from thesis_repro.report import texts
-
-    text = json.dumps(record)
-    if not vars(options).get("json"):
-        text = texts.render(template, record=record, **values).rstrip()
-    print(text)
-    for name, path in _output_files(options).items():
-        program.log.info(f"{path}: {OUTPUT_FILES[name][0]}")
 
 
 def main(arguments: list[str] | None = None) -> int:

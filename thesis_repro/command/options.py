@@ -7,7 +7,9 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from thesis_repro.running import settings
+from joblib import cpu_count
+
+from thesis_repro.running import values
 
 # options of several commands, as arguments of argparse's `add_argument`
 SHARED: dict[str, dict[str, Any]] = {
@@ -22,7 +24,7 @@ SHARED: dict[str, dict[str, Any]] = {
         help="00 to 21, or without --kitti a raw drive of KITTI or a folder with your own frames",
     ),
     "--frames": dict(
-        type=settings.number_of_frames,
+        type=values.number_of_frames,
         metavar="N|all",
         help="use the first N frames of a sequence (all)",
     ),
@@ -48,13 +50,13 @@ SHARED: dict[str, dict[str, Any]] = {
         "parts never have any)",
     ),
     "--spread": dict(
-        type=settings.positive_whole_number,
+        type=values.positive_whole_number,
         metavar="N",
         help="N keypoints, as far apart as their number allows, in place of the 2000 strongest (with study: in "
         "runs with masks)",
     ),
     "--fill": dict(
-        type=settings.positive_whole_number,
+        type=values.positive_whole_number,
         metavar="N",
         help="fill each of 16 x 5 fields of the frame to N keypoints where the mask leaves fewer",
     ),
@@ -128,9 +130,7 @@ COMMANDS: dict[str, dict[str, dict[str, Any]]] = {
         "out": dict(
             type=Path, metavar="OUT", help="new folder, or one in which this command was stopped"
         ),
-        "--profile": dict(
-            choices=tuple(settings.PROFILES), default="demo", help="size of the world (demo)"
-        ),
+        "--profile": NAMED,
     },
     "check-data": {
         **_shared("--kitti"),
@@ -262,7 +262,7 @@ COMMANDS: dict[str, dict[str, dict[str, Any]]] = {
             "folder with the path NN.txt of another system for each sequence, in KITTI's or TUM's format, metres",
         ),
         "--widths": dict(
-            type=settings.list_of_widths,
+            type=values.list_of_widths,
             nargs="+",
             action="extend",
             metavar="W,W",
@@ -276,15 +276,15 @@ COMMANDS: dict[str, dict[str, dict[str, Any]]] = {
             help="run controls, too, for masks of width W (10)",
         ),
         "--repetitions": dict(
-            type=settings.positive_whole_number,
+            type=values.positive_whole_number,
             default=5,
             metavar="N",
             help="shuffles of the matched points for each run (5)",
         ),
         "--estimator": NAMED,
         "--jobs": dict(
-            type=settings.positive_whole_number,
-            default=settings.cores(),
+            type=values.positive_whole_number,
+            default=cpu_count(),
             metavar="N",
             help="number of processes (number of cores)",
         ),
@@ -298,6 +298,11 @@ COMMANDS: dict[str, dict[str, dict[str, Any]]] = {
 
 def named(command: str) -> dict[str, dict[str, Any]]:
     """Return the options whose names stand in tables, which take a second to import."""
+    if command == "synthesize":
+        import street_world
+
+        sizes = list(street_world.SIZES)
+        return {"--profile": dict(choices=sizes, default="demo", help="size of the world (demo)")}
     from thesis_repro.masks import BOUNDARIES, KINDS
     from thesis_repro.odometry.estimators import COMPARED, DETECTORS, ESTIMATORS
 

@@ -2,6 +2,7 @@
 
 from thesis_repro.masks.filter import (
     CANNY,
+    WIDTHS,
     canny_edges,
     check_width,
     coverage,
@@ -29,6 +30,7 @@ __all__ = [
     "KINDS",
     "MOVABLE",
     "THESIS_MASKS",
+    "WIDTHS",
     "MaskSettings",
     "boundaries_found",
     "canny_edges",

@@ -14,6 +14,7 @@ from thesis_repro.errors import InputError
 from thesis_repro.masks.memory import remembered
 
 CANNY = (5, 15)  # both thresholds (Section 3.6)
+WIDTHS = tuple(range(1, 16))  # dilation widths of the thesis, pixels (Section 3.6)
 
 
 def thesis_mask(label_map: np.ndarray, size: tuple[int, int], dilation_width: int) -> np.ndarray:

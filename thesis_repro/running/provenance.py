@@ -22,8 +22,8 @@ import pandas as pd
 from thesis_repro.errors import InputError
 from thesis_repro.running import program
 from thesis_repro.running.files import TEMPORARY, progress, write_text
-from thesis_repro.running.settings import ROOT
 
+ROOT = Path(__file__).resolve().parents[2]  # holds the packages
 RECORD = "made-from.json"  # in the folder of a stage
 
 

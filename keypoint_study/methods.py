@@ -1,0 +1,119 @@
+"""What a study compares: one table of methods.
+
+A method chooses the keypoints of a run. Beside all keypoints and masks, there are *controls*: masks
+and settings that leave as many keypoints as the masks of the segmentation, chosen differently. If
+the odometry gains as much from a control, the segmentation is not what helps. A new method is a
+function and an entry in METHODS, a new error of a path one in study/errors.py.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, NamedTuple, TypeAlias
+
+from keypoint_study.controls import ImageEdges, Mirrored, OtherFrame, RandomLines
+from keypoint_study.sources import Source
+from thesis_repro.data.kitti import TRUE_LABELS, Sequence
+from thesis_repro.masks import MaskSettings
+from thesis_repro.odometry import THESIS, OdometrySettings
+
+# All corrections together. No error was used to choose them: a label map of 320 columns places a
+# boundary within about 2 pixels of the frame, and within 10 pixels of its border the Lucas-Kanade
+# window of 21 pixels is cut off.
+CORRECTED = MaskSettings("exact", symmetric=True, movable=2, margin=10)
+
+
+# The methods: functions of a sequence, a source and a width of its masks in pixels
+
+Choice: TypeAlias = tuple[OdometrySettings, Any]  # settings and masks of a run, or None
+
+
+def all_keypoints(sequence: Sequence, source: Source, width: int | None) -> Choice:
+    """Run as the thesis does, without masks."""
+    return THESIS, None
+
+
+def masked(sequence: Sequence, source: Source, width: int | None) -> Choice:
+    """Run with the masks of the source."""
+    return THESIS, source.masks(sequence, width)
+
+
+def brought(sequence: Sequence, source: Source, width: int | None) -> Choice:
+    """Run with what the source brings in place of the odometry or parts of it."""
+    return THESIS, source
+
+
+def altered(masks: type[OtherFrame]) -> Callable[..., Choice]:
+    """Return a method with masks that are made from those of the source."""
+    return lambda sequence, source, width: (THESIS, masks(source, sequence, width))
+
+
+def made_with(settings: MaskSettings | None = None, **changes: Any) -> Callable[..., Choice]:
+    """Return a method with other masks from the same label maps.
+
+    settings: of the masks; None: those of the source, with changes.
+    """
+
+    def choose(sequence: Sequence, source: Source, width: int | None) -> Choice:
+        ids = source.settings.ids
+        chosen = replace(settings or source.settings, **{"ids": ids, **changes})
+        return masked(sequence, replace(source, settings=chosen), width)
+
+    return choose
+
+
+def from_true_labels(sequence: Sequence, source: Source, width: int | None) -> Choice:
+    """Run with masks from the true label maps."""
+    settings = replace(source.settings, ids="labels")
+    true = replace(source, folder=sequence.folder / TRUE_LABELS, settings=settings)
+    return masked(sequence, true, width)
+
+
+class Method(NamedTuple):
+    """A way to choose the keypoints of a run.
+
+    title: in tables and figures. group: REFERENCE, BROUGHT by the user, from LABEL_MAPS of the
+    user, a CONTROL without segmentation, which keeps as many keypoints as the masks do but knows
+    nothing of the classes, or THESIS_ONLY, for a figure of the thesis. choose: from a sequence, a
+    source and a width to the settings and masks of a run.
+    """
+
+    title: str
+    group: str
+    choose: Callable[[Sequence, Source, int | None], Choice]
+
+
+REFERENCE, BROUGHT, LABEL_MAPS, CONTROL, THESIS_ONLY = (
+    "reference",
+    "brought",
+    "label maps",
+    "control",
+    "thesis",
+)
+METHODS = {  # in the order in which they are shown
+    "baseline": Method("all keypoints", REFERENCE, all_keypoints),
+    "masked": Method("masks", BROUGHT, masked),
+    "keypoints": Method("own keypoints", BROUGHT, brought),  # these two as sources.KINDS has them
+    "paths": Method("path of another system", BROUGHT, brought),
+    "exact-boundaries": Method(
+        "exact class boundaries", LABEL_MAPS, made_with(boundaries="exact", keep="boundaries")
+    ),
+    "corrected": Method("corrected mask", LABEL_MAPS, made_with(CORRECTED)),
+    "static-boundaries": Method(
+        "boundaries of static things", LABEL_MAPS, made_with(keep="static-boundaries")
+    ),
+    "static": Method("all but movable things", LABEL_MAPS, made_with(keep="static")),
+    "inverse": Method("all but the boundaries", LABEL_MAPS, made_with(keep="inverse")),
+    "true-labels": Method("true label maps", LABEL_MAPS, from_true_labels),
+    "other-frame": Method("mask of another frame", CONTROL, altered(OtherFrame)),
+    "mirrored": Method("mirrored mask", CONTROL, altered(Mirrored)),
+    "random-lines": Method("random lines", CONTROL, altered(RandomLines)),
+    "image-edges": Method("edges of the image", CONTROL, altered(ImageEdges)),
+    # these two as many keypoints as masks leave, which the job says
+    "fewer": Method("fewer keypoints", CONTROL, all_keypoints),
+    "spread": Method("keypoints spread out", CONTROL, all_keypoints),
+    "reduced": Method("reduced keypoints", THESIS_ONLY, all_keypoints),  # Figure 4.12
+}
+AS_SLAM_SYSTEMS = ("static", "inverse", "static-boundaries")
+OF_LABEL_MAPS = ("exact-boundaries", "corrected", *AS_SLAM_SYSTEMS, "true-labels")
+# the methods with masks beside "masked", in the order of their runs
+MASK_CONTROLS = ("other-frame", "mirrored", "random-lines", "image-edges", *OF_LABEL_MAPS)

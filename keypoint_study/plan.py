@@ -1,0 +1,177 @@
+"""A study with your own masks: its settings, the check of its input, and its runs."""
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from keypoint_study import compare, jobs, runner, sources, worth
+from keypoint_study.sources import Source
+from thesis_repro.data.kitti import Sequence
+from thesis_repro.errors import InputError
+from thesis_repro.odometry import THESIS, metrics
+from thesis_repro.running import program, provenance
+
+RUNS = "runs"  # folder of the results of the runs
+
+
+@dataclass(frozen=True)
+class Study:
+    """One or several sources of masks, own keypoints or paths, compared with all keypoints.
+
+    sequences: their names. widths: pixels, for masks from label maps. tested: width of the
+    controls, None for no controls. estimators: some of `jobs.ESTIMATORS`. frames: number of frames
+    of each sequence, None for all. scale_gate: metres, see OdometrySettings. masked_settings: other
+    settings of the odometry, for all runs with masks. without_border: of Sequence.
+    """
+
+    kitti: Path
+    sequences: tuple[str, ...]
+    sources: tuple[Source, ...]
+    widths: tuple[int, ...]
+    tested: int | None = None
+    estimators: tuple[str, ...] = ("thesis",)
+    repetitions: int = 1
+    frames: int | None = None
+    scale_gate: float = THESIS.scale_gate
+    masked_settings: dict[str, Any] = field(default_factory=dict)
+    without_border: bool = False
+
+    @cached_property
+    def opened(self) -> list[Sequence]:
+        """The sequences, cut to `frames` frames."""
+        sequences = [Sequence(self.kitti, name).subset(self.frames) for name in self.sequences]
+        if self.without_border:
+            return [sequence.without_border() for sequence in sequences]
+        return sequences
+
+    def check(self) -> None:
+        """Raise InputError for the first problem with the settings, the sequences or the masks."""
+        for sequence in self.opened:
+            if len(sequence) < 3:
+                raise InputError(
+                    f"{sequence.folder}: {len(sequence)} frames; a study needs 3 or more"
+                )
+            if sequence.name in compare.COLUMNS:
+                raise InputError(
+                    f"{sequence.folder}: has the name of a column of the tables; rename the sequence"
+                )
+        widths = list(self.widths)
+        if self.tested is not None:
+            widths.append(self.tested)
+        sources.check(self.sources, self.opened, widths)
+
+    def run(self, folder: Path, processes: int = 1, scheduler: str | None = None) -> runner.Outcome:
+        """Run the jobs whose results are not in the folder yet, see `runner.run_jobs`.
+
+        Sequences whose true poses are not the camera's are left out of the table, with a warning.
+        Raises InputError for a folder with results of another number of frames, and if no sequence
+        is left.
+        """
+        run_jobs = partial(
+            runner.run_jobs,
+            sequences=self.opened,
+            sources=self.sources,
+            folder=folder / RUNS,
+            processes=processes,
+            scheduler=scheduler,
+            scale_gate=self.scale_gate,
+            masked_settings=self.masked_settings,
+        )
+        with provenance.claimed(folder):
+            settings = {"scale_gate": self.scale_gate, **self.masked_settings}
+            if self.without_border:
+                settings["without_border"] = True
+            provenance.stage(folder, replace=False, frames=self.frames, **settings)
+            first_jobs = jobs.first_jobs(
+                self.opened,
+                dict.fromkeys(self.estimators, self.widths),
+                tested=self.tested,
+                sources=self.sources,
+                repetitions=self.repetitions,
+            )
+            outcome = first = run_jobs(first_jobs)
+            if (first.table["method"] == "baseline").all():
+                raise InputError(
+                    "every run but those with all keypoints failed (see above), so there is nothing to "
+                    "compare"
+                )
+            foreign = self._foreign_truths(first.table, folder)
+            if self.tested:
+                more_jobs = runner.keypoint_controls(
+                    first.table,
+                    self.opened,
+                    self.sources,
+                    self.repetitions,
+                    self.tested,
+                    self.estimators,
+                )
+                done = set(zip(first.table["sequence"], first.table["run"], strict=True))
+                done_jobs = [job for job in first_jobs if (job.sequence, job.name) in done]
+                both = run_jobs(done_jobs + more_jobs)
+                outcome = replace(
+                    both,
+                    made=both.made + first.made,
+                    kept=both.kept - first.made,  # the runs of the first call count as kept
+                    failed_jobs=both.failed_jobs + first.failed_jobs,
+                    warnings=first.warnings + both.warnings,
+                )
+        table = outcome.table[~outcome.table["sequence"].isin(foreign)]
+        return replace(outcome, table=table, warnings=[*outcome.warnings, *foreign.values()])
+
+    def _foreign_truths(self, table: pd.DataFrame, folder: Path) -> dict[str, str]:
+        """Return a line for each sequence whose true poses are not the camera's, and print it.
+
+        Raises InputError if they are those of all sequences.
+        """
+        runs = table[(table["method"] == "baseline") & (table["repetition"] == 0)]
+        poses = runner.run_poses(runs, folder / RUNS)
+        lines = {}
+        for sequence in self.opened:
+            reasons = [
+                metrics.foreign_truth(estimate, sequence.poses)
+                for (name, _), estimate in poses.items()
+                if name == sequence.name
+            ]
+            if reasons and all(reasons):  # with every estimator
+                lines[sequence.name] = f"{sequence.poses_path}: {reasons[0]}"
+        if set(runs["sequence"]) == set(lines):
+            line = next(iter(lines.values()))
+            raise InputError(f"{line}; no sequence with other poses is left to compare")
+        lines = {name: f"{line}; sequence {name} is left out" for name, line in lines.items()}
+        for line in lines.values():
+            program.log.warning(line)
+        return lines
+
+    def worths(
+        self, folder: Path, processes: int = 1, scheduler: str | None = None
+    ) -> pd.DataFrame | None:
+        """Return what a keypoint of each source is worth (`worth.measure`), without ground truth.
+
+        What is in the folder is kept. None if no source has masks or keypoints. With a tested
+        width, also of the controls.
+        """
+        if all(source.kind == "paths" for source in self.sources):
+            return None
+        return worth.measure(
+            self.opened,
+            self.sources,
+            self.shown_width,
+            folder / "worth",
+            processes=processes,
+            scheduler=scheduler,
+            with_controls=self.tested is not None,
+            masked_settings=self.masked_settings,
+        )
+
+    @property
+    def shown_width(self) -> int | None:
+        """The dilation width (pixels) of the masks in figures.
+
+        It is the tested width, or else the middle one; None for only ready-made masks.
+        """
+        if self.tested or not self.widths:
+            return self.tested
+        return self.widths[len(self.widths) // 2]

@@ -1,0 +1,132 @@
+"""The HTML of figures, tables and texts, and the page of a study, which needs no network."""
+
+import importlib.metadata
+import json
+import platform
+import subprocess
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import mistune
+from markupsafe import Markup
+
+from keypoint_study.report import texts
+from thesis_repro.running.provenance import ROOT
+
+PAGE = "index.html"
+ENDINGS = {"figure": (".svg", ".webp", ".pdf"), "table": (".csv", ".md", ".tex"), "text": (".md",)}
+# The figures, tables and texts of a study: dicts with kind ("figure", "table", "text"), name (of
+# the files), title and caption.
+ARTEFACTS = json.loads((Path(__file__).parent / "captions.json").read_text(encoding="utf-8"))
+OPENING = ("findings", "figure-comparison", "table-summary")  # ids of those at the top of a page
+ROWS_SHOWN = 36  # of a table; a longer one is linked
+# packages that affect the numbers most
+PACKAGES = (
+    "tensorflow",
+    "keras",
+    "opencv-python-headless",
+    "opencv-python",
+    "opencv-contrib-python-headless",
+    "opencv-contrib-python",
+    "numpy",
+)
+# what only some artefacts have: those of the thesis; a text that the page folds in part; a table,
+# and one that is short enough to be shown
+DEFAULTS: dict[str, Any] = {"number": None, "makers": [], "thesis": {}, "left_out": None}
+DEFAULTS |= {"content": None, "details": None, "rows": 0, "markdown": None}
+
+
+def build_study(folder: Path, names: list[tuple[str, str]], **facts: Any) -> str:
+    """Return the page of a study as HTML.
+
+    names: (kind, name) of its files. facts: further values of the template, and the study itself.
+    """
+    described = []
+    for artefact in ARTEFACTS:
+        for kind, name in names:
+            # one artefact describes the figures of all sequences
+            base, _, sequence = name.partition("-")
+            if (kind, base) == (artefact["kind"], artefact["name"]):
+                title = f"{artefact['title']} {sequence}".strip()
+                described.append(describe(folder, artefact | {"name": name, "title": title}))
+    compared = dict.fromkeys(facts["kinds"][source.kind] for source in facts["study"].sources)
+    return texts.render(
+        "study.html.j2",
+        title=f"{' and '.join(compared).capitalize()}, compared with all keypoints",
+        artefacts=described,
+        notebooks={},
+        made=made_with() | made_on(),
+        **facts,
+    )
+
+
+def describe(folder: Path, artefact: dict[str, Any]) -> dict[str, Any]:
+    """Return the values that a template needs to show an artefact, or to report it as missing."""
+    kind, name = artefact["kind"], artefact["name"]
+    files = [path for end in ENDINGS[kind] if (path := folder / f"{name}{end}").is_file()]
+    content = {}
+    if files and kind == "text":
+        content = _of_text(files[0].read_text(encoding="utf-8"))
+    elif files and kind == "table" and files[0].suffix == ".csv":
+        content = _of_table(files[1].read_text(encoding="utf-8"))
+    there = bool(files) and (kind == "figure" or bool(content))
+    identity = name if kind == "text" else f"{kind}-{name}"
+    described = {
+        "id": identity,
+        "there": there,
+        "files": [path.name for path in files],
+        "opens": there and identity in OPENING,
+    }
+    return DEFAULTS | artefact | content | described
+
+
+def _of_text(text: str) -> dict[str, Any]:
+    """Return a text in Markdown; the page folds the part after the first heading."""
+    first, heading, rest = text.partition("\n## ")
+    details = from_markdown(f"## {rest}") if heading else None
+    return {"content": from_markdown(first), "details": details}
+
+
+def _of_table(text: str) -> dict[str, Any]:
+    """Return a table in Markdown with its data note."""
+    table, _, _ = text.partition("\n\n")
+    rows = table.count("\n") - 1
+    markdown = text if rows <= ROWS_SHOWN else None
+    return {"content": from_markdown(table), "rows": rows, "markdown": markdown}
+
+
+class _Renderer(mistune.HTMLRenderer):
+    def heading(self, text: str, level: int, **attributes: Any) -> str:
+        # lower than the headings of the page
+        return super().heading(text, max(4, level + 1), **attributes)
+
+
+def from_markdown(text: str) -> Markup:
+    """Convert Markdown to HTML. HTML tags in the Markdown are shown as text."""
+    convert = mistune.create_markdown(renderer=_Renderer(escape=True), plugins=["table"])
+    return Markup(convert(text))
+
+
+def made_with() -> dict[str, Any]:
+    """Return the packages of the results, with their versions."""
+    versions = {}
+    for name in PACKAGES:
+        with suppress(importlib.metadata.PackageNotFoundError):  # a study needs no TensorFlow
+            versions[name] = importlib.metadata.version(name)
+    return {"packages": versions}
+
+
+def made_on() -> dict[str, Any]:
+    """Return the Python, the machine and the commit of the results."""
+    facts = {
+        "python": platform.python_version(),
+        "machine": f"{platform.system()} {platform.machine()}",
+    }
+    # --git-dir excludes a repository in a parent folder
+    describe = ["git", f"--git-dir={ROOT / '.git'}", f"--work-tree={ROOT}", "describe"]
+    describe += ["--always", "--dirty", "--exclude=*", "--abbrev=12"]
+    with suppress(OSError, subprocess.CalledProcessError):
+        answer = subprocess.run(describe, capture_output=True, text=True, check=True)
+        facts["commit"] = answer.stdout.strip()
+    return facts

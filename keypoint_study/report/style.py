@@ -1,0 +1,316 @@
+"""The style of all figures and tables, and functions that write them.
+
+Figures are written as SVG or WebP, tables as CSV and Markdown.
+"""
+
+import re
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from textwrap import fill
+from typing import Any
+
+import matplotlib
+import matplotlib.pyplot as plt
+import numpy as np
+import pandas as pd
+from matplotlib.patches import Patch
+from matplotlib.ticker import Locator, LogLocator, MaxNLocator, NullLocator
+from PIL import ExifTags, Image
+
+from keypoint_study.report.texts import in_markdown
+from thesis_repro.data.cityscapes import LABELS, colorize
+from thesis_repro.running.files import atomic, write_text
+
+PAGE_WIDTH = 7.2  # inches
+NOTE_LETTERS = 22  # of a note, in an inch
+# Okabe and Ito's colours, distinguishable with any colour vision
+BLACK, ORANGE, SKY, GREEN = "#000000", "#e69f00", "#56b4e9", "#009e73"
+BLUE, RED, PINK = "#0072b2", "#d55e00", "#cc79a7"
+# four of Paul Tol's, for figures of more lines
+INDIGO, OLIVE, WINE, GRAY = "#332288", "#999933", "#882255", "#888888"
+LINE_COLORS = BLUE, RED, GREEN, ORANGE, PINK, SKY, BLACK, INDIGO, OLIVE, WINE, GRAY
+# of matplotlib, see `use`; what is not listed has matplotlib's default
+SETTINGS: dict[Any, Any] = {
+    "font.size": 9,
+    "font.sans-serif": ["DejaVu Sans", "sans-serif"],  # each text of an SVG file lists them
+    "axes.titlesize": 9,
+    "axes.labelsize": 9,
+    "legend.fontsize": 8,
+    "legend.frameon": False,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.prop_cycle": plt.cycler(color=LINE_COLORS),
+    "grid.color": "#dddddd",
+    "grid.linewidth": 0.6,
+    "lines.linewidth": 1.4,
+    "image.interpolation": "nearest",
+    "svg.fonttype": "none",
+    "text.parse_math": False,  # names of files and sequences may contain dollar signs
+    "svg.hashsalt": "thesis-repro",  # the same figure gives the same file
+    "savefig.dpi": 160,
+}
+TRUTH, BASELINE, MASKED, REDUCED = BLACK, BLUE, RED, GREEN  # ground truth and methods in chapter 4
+DATES = {".svg": "Date", ".pdf": "CreationDate"}  # matplotlib's names
+# note of figures that show no data
+DIAGRAM = "drawn by the notebook; it does not depend on the data at hand"
+# style of keypoints on a frame
+KEYPOINT: dict[str, Any] = {"s": 2.5, "color": "#00e5a0", "linewidths": 0}
+EDGE_COLOR = (255, 140, 0)  # red, green, blue of edges on a frame
+
+
+def use() -> None:
+    """Let matplotlib draw in this style from now on.
+
+    Programs and notebooks call it at their start. Settings of the user's own are reset to
+    matplotlib's defaults, so that figures look the same everywhere. Matplotlib reads its settings
+    when it makes a figure and again when it draws it.
+    """
+    matplotlib.rcdefaults()
+    matplotlib.rcParams.update(SETTINGS)
+
+
+@contextmanager
+def applied() -> Iterator[None]:
+    """Let matplotlib draw in this style within a block, and reset its settings afterwards."""
+    with matplotlib.rc_context():
+        use()
+        yield
+
+
+def line_style(index: int) -> dict[str, Any]:
+    """Return colour and dash of the index-th line of a figure.
+
+    44 styles differ; neighbours also differ in dashes.
+    """
+    dashes = "-", "--", "-.", ":"
+    return {
+        "color": LINE_COLORS[index % len(LINE_COLORS)],
+        "linestyle": dashes[index % len(dashes)],
+    }
+
+
+def interval_style(color: str, cap: str) -> dict[str, Any]:
+    """Return the style of an interval with a cap at each end.
+
+    The caps are longer than the mark of the mean, so that an interval shorter than it is seen, too.
+    cap: "|" for an interval along x, "_" along y.
+    """
+    return {"color": color, "linewidth": 1.8, "marker": cap, "markersize": 7}
+
+
+def label_colors(label_map: np.ndarray, frame: np.ndarray) -> np.ndarray:
+    """Return a label map in colours, enlarged to the frame's size for display.
+
+    masks/filter.py enlarges in another way.
+    """
+    height, width = frame.shape[:2]
+    rows = np.arange(height) * label_map.shape[0] // height
+    columns = np.arange(width) * label_map.shape[1] // width
+    return colorize(label_map[np.ix_(rows, columns)])
+
+
+def new_figure(
+    rows: int = 1, columns: int = 1, height: float = 3.2, width: float = PAGE_WIDTH, **options: Any
+) -> tuple[plt.Figure, Any]:
+    """Return a figure and its axes. height, width: inches."""
+    return plt.subplots(rows, columns, figsize=(width, height), layout="constrained", **options)
+
+
+def frame_panels(
+    frame: np.ndarray, rows: int = 1, columns: int = 1, width: float = PAGE_WIDTH
+) -> tuple[plt.Figure, list[Any]]:
+    """Return a figure and a list of its axes.
+
+    The axes have the shape of a frame and room for titles.
+    """
+    frame_height, frame_width = frame.shape[:2]
+    panel_height = width / columns * frame_height / frame_width + 0.27
+    figure, axes = new_figure(rows, columns, rows * panel_height, width, squeeze=False)
+    return figure, list(axes.flat)
+
+
+def show_image(axes: plt.Axes, image: np.ndarray, title: str, **options: Any) -> None:
+    """Show an image without ticks; an image with one channel is gray."""
+    axes.imshow(image, cmap=options.pop("cmap", "gray"), **options)
+    axes.set_title(title)
+    axes.set_axis_off()
+
+
+def legend_below(figure: Any, panels: Iterable[plt.Axes], columns: int) -> None:
+    """Add a legend below the figure with each label of the panels once."""
+    handles: dict[str, Any] = {}
+    for panel in panels:
+        panel_handles, labels = panel.get_legend_handles_labels()
+        handles |= dict(zip(labels, panel_handles))
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=columns)
+
+
+def class_legend(figure: plt.Figure, *label_maps: np.ndarray, also: Iterable[Any] = ()) -> None:
+    """Add a legend of the classes in label maps below a figure, and make the figure higher.
+
+    also: further handles.
+    """
+    ids = np.unique(np.concatenate([np.unique(label_map) for label_map in label_maps]))
+    names: dict[tuple, list[str]] = {}  # some Cityscapes labels share a colour
+    for index in ids:
+        names.setdefault(LABELS[index].color, []).append(LABELS[index].name)
+    handles: list[Any] = []
+    for color, labels in names.items():
+        handles.append(Patch(color=tuple(np.array(color) / 255), label=", ".join(labels)))
+    handles += also
+    rows = -(-len(handles) // 5)
+    figure.set_figheight(figure.get_figheight() + 0.1 + 0.16 * rows)
+    figure.legend(handles=handles, loc="outside lower center", ncols=5, fontsize=7, markerscale=2)
+
+
+def ratio_axis(axis: Any, values: np.ndarray | list[float]) -> None:
+    """Make an axis (such as axes.yaxis) logarithmic.
+
+    It gets a few round ticks, and limits around the positive values.
+    """
+    positive = np.asarray(values, float)
+    positive = positive[np.isfinite(positive) & (positive > 0)]
+    low, high = positive.min(), positive.max()
+    least_margin = 1.1 if high < 1.1 * low else 1
+    margin = max((high / low) ** 0.05, least_margin)
+    low, high = low / margin, high * margin
+    locator: Locator
+    if high < 5 * low:
+        # ticks at equal differences are rounder here than ticks at equal ratios
+        locator = MaxNLocator(5)
+    elif high < 100 * low:
+        locator = LogLocator(subs=(1, 2, 5), numticks=6)
+    else:
+        locator = LogLocator(subs=(1,), numticks=6)
+    axis.axes.set(**{f"{axis.axis_name}scale": "log", f"{axis.axis_name}lim": (low, high)})
+    axis.set_major_locator(locator)
+    axis.set_major_formatter("{x:g}")
+    axis.set_minor_locator(NullLocator())
+
+
+def save_figure(figure: plt.Figure, folder: Path, name: str, note: str) -> None:
+    """Write folder/name.webp if the figure contains images, else folder/name.svg.
+
+    The data note is at the foot of the figure, no wider than it, and in the file's metadata.
+    """
+    # a tight box would move legends at the figure's edge onto the note, so their places are fixed
+    figure.draw_without_rendering()
+    figure.set_layout_engine("none")
+    for legend in figure.legends:
+        box = legend.get_window_extent().transformed(figure.transFigure.inverted())
+        legend.borderaxespad = 0
+        legend.set_loc("lower left")
+        legend.set_bbox_to_anchor((box.x0, box.y0), transform=figure.transFigure)
+    box = figure.get_tightbbox()  # inches
+    figure.text(
+        (box.x0 + box.x1) / 2 / figure.get_figwidth(),
+        -0.08 / figure.get_figheight(),
+        fill(note, int(NOTE_LETTERS * box.width)),
+        fontsize=6,
+        color="#777777",
+        ha="center",
+        va="top",
+    )
+    if any(axes.images for axes in figure.axes):
+        ending, other, note_in_file = ".webp", ".svg", Image.Exif()
+        note_in_file[ExifTags.Base.ImageDescription] = note
+        options: dict[str, Any] = {"pil_kwargs": {"quality": 75, "exif": note_in_file}}
+    else:
+        ending, other = ".svg", ".webp"
+        options = {"metadata": {"Creator": None, "Description": note}}
+    write_figure(figure, folder / f"{name}{ending}", **options)
+    # an earlier run may have written the other format
+    (folder / f"{name}{other}").unlink(missing_ok=True)
+
+
+def write_figure(figure: plt.Figure, path: str | Path, **options: Any) -> None:
+    """Write a figure in the format that the path's ending names, without a date."""
+    ending = Path(path).suffix.lower()
+    if ending in DATES:
+        options["metadata"] = {DATES[ending]: None} | options.get("metadata", {})
+    with atomic(path) as temporary:
+        figure.savefig(temporary, bbox_inches="tight", pad_inches=0.04, **options)
+        if ending == ".svg":
+            svg = temporary.read_text(encoding="utf-8")
+            temporary.write_text(same_on_all_processors(svg), encoding="utf-8")
+
+
+def same_on_all_processors(svg: str) -> str:
+    """Return the text of an SVG file without what the last bits of its coordinates change.
+
+    Sums of numbers end in other bits with wider vector instructions. So coordinates have three
+    decimals in place of six. Matplotlib names clip paths by a digest of their coordinates; they are
+    numbered here.
+    """
+    names = dict.fromkeys(re.findall(r'id="([a-z][0-9a-f]{10})"', svg))
+    numbers = {name: number for number, name in enumerate(names, 1)}
+
+    def in_tag(tag: re.Match) -> str:
+        rounded = re.sub(r"(?<![\w.#-])(-?\d+\.\d{4,}|-0(?![\w.]))", _rounded, tag[0])
+        return re.sub(
+            r"""(id="|url\(#|href="#)([a-z][0-9a-f]{10})\b""",
+            lambda link: f"{link[1]}shared{numbers[link[2]]}",
+            rounded,
+        )
+
+    return re.sub(r"<[^>]*>", in_tag, svg)  # not the texts between the tags
+
+
+def _rounded(number: re.Match) -> str:
+    text = f"{float(number[0]):.3f}".rstrip("0").rstrip(".")
+    return "0" if text == "-0" else text
+
+
+def save_table(table: pd.DataFrame, folder: Path, name: str, note: str) -> None:
+    """Write folder/name.csv and folder/name.md with the data note under the Markdown table.
+
+    A text between ** is bold in Markdown.
+    """
+    # spreadsheets take a text that begins so for a formula
+    cells = table.replace({r"^([=+@-])": r"'\1", r"\*\*": ""}, regex=True)
+    write_text(folder / f"{name}.csv", cells.to_csv(index=False, lineterminator="\n"))
+    text = markdown(table).replace(r"\*\*", "**")
+    write_text(folder / f"{name}.md", f"{text}\n{in_markdown(note)}\n")
+
+
+def save_all(
+    figures: dict[str, plt.Figure], tables: dict[str, pd.DataFrame], folder: Path, note: str
+) -> list[tuple[str, str]]:
+    """Write {name: figure} and {name: table}, except empty tables.
+
+    Returns (kind, name) of each one that was written.
+    """
+    written = []
+    for name, figure in figures.items():
+        save_figure(figure, folder, name, note)
+        plt.close(figure)
+        written.append(("figure", name))
+    for name, table in tables.items():
+        if len(table):
+            save_table(table, folder, name, note)
+            written.append(("table", name))
+    return written
+
+
+def markdown(table: pd.DataFrame) -> str:
+    """Return a pandas table as Markdown, an empty one as "".
+
+    Numbers are aligned to the right, and missing values are empty. Names are no HTML.
+    """
+    if table.empty:
+        return ""
+    numeric = [pd.api.types.is_numeric_dtype(table[column]) for column in table]
+    rows = [list(map(_cell, table.columns)), ["---:" if right else ":---" for right in numeric]]
+    rows += [list(map(_cell, row)) for row in table.itertuples(index=False)]
+    return "".join(f"| {' | '.join(row)} |\n" for row in rows)
+
+
+def _cell(value: Any) -> str:
+    if pd.isna(value):
+        return ""
+    if isinstance(value, float):
+        return f"{value:g}"
+    return in_markdown(value)

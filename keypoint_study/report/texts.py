@@ -1,0 +1,83 @@
+"""Texts made from templates (templates/*.j2), and numbers and names as texts."""
+
+import os
+import re
+import shlex
+from math import ceil, log10
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import pandas as pd
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+from keypoint_study import compare
+from thesis_repro.errors import one_line
+
+DIGITS = 2  # of a ratio that is not close to 1
+LOADER = FileSystemLoader(Path(__file__).parent / "templates")  # others may add their folders
+TEMPLATES = Environment(
+    loader=LOADER,
+    autoescape=lambda name: ".html" in (name or ""),
+    undefined=StrictUndefined,
+    trim_blocks=True,
+    lstrip_blocks=True,
+)
+
+
+def render(template: str, **values: Any) -> str:
+    """Return the text of a template in the folder templates.
+
+    Repeated empty lines in Markdown become one.
+    """
+    text = TEMPLATES.get_template(template).render(values).strip() + "\n"
+    if ".md" in template:
+        text = re.sub(r"\n{3,}", "\n\n", text)
+    return text
+
+
+def number(value: float) -> str:
+    """Return a ratio as text with two digits, or with more if it would look like 0 or 1."""
+    digits = DIGITS
+    distance = min(abs(value), abs(value - 1))
+    if 0 < distance < 0.5 * 10**-DIGITS:
+        digits = min(6, ceil(-log10(distance)) + 1)
+    return f"{value:.{digits}f}"
+
+
+def short(row: dict[str, Any] | pd.Series) -> str:
+    """Return "1.09 (0.98-1.32)" for a row with ratio, low and high.
+
+    Without an interval (low is missing) it is only the ratio.
+    """
+    mean = number(row["ratio"])
+    if pd.isna(row["low"]):
+        return mean
+    return f"{mean} ({number(row['low'])}-{number(row['high'])})"
+
+
+def ratio(row: dict[str, Any] | pd.Series) -> str:
+    """Return `short` with what the interval is: "1.09 (95 % CI 0.98-1.32)"."""
+    return short(row).replace("(", f"({compare.LEVEL} % CI ")
+
+
+def in_markdown(text: object) -> str:
+    """Return a name as one line that Markdown shows as it is.
+
+    It then makes no link, picture, HTML tag, emphasis or cell of a table.
+    """
+    special = r"[\\`*<>|&~]|\](?=[(\[])|(?<![^\W_])_|_(?![^\W_])"
+    return re.sub(special, r"\\\g<0>", one_line(text))
+
+
+def in_url(name: str) -> str:
+    """Return the name of a file for a link, whatever its bytes."""
+    return quote(os.fsencode(name))
+
+
+TEMPLATES.filters |= {
+    "in_markdown": in_markdown,
+    "in_shell": shlex.quote,
+    "one_line": one_line,
+    "urlencode": in_url,
+}

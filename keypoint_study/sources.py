@@ -1,0 +1,286 @@
+"""What a user brings to a study: masks, keypoints or the paths of another system."""
+
+import re
+import runpy
+from collections.abc import Callable, Collection, Iterable
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+import pandas as pd
+
+from thesis_repro import odometry
+from thesis_repro.data import label_ids
+from thesis_repro.data.kitti import Sequence
+from thesis_repro.data.trajectories import have_times, read_poses, read_poses_at
+from thesis_repro.errors import InputError, cause
+from thesis_repro.masks import MaskSettings
+from thesis_repro.masks.folders import LabelMasks, MaskFolder, folder_of_sequence, read_mask
+from thesis_repro.running import provenance
+from thesis_repro.running.files import images, listed
+
+KINDS = {
+    "labels": "label maps",
+    "masks": "masks",
+    "keypoints": "own keypoints",
+    "paths": "paths of another system",
+}
+UNMASKED = ("keypoints", "paths")  # kinds without masks; their methods have the same names
+FileMasks: TypeAlias = LabelMasks | MaskFolder  # both have `paths`, the files that they read
+
+
+@dataclass(frozen=True)
+class Source:
+    """A source of masks, or of runs without masks.
+
+    folder: holds one folder for each sequence or, for a single sequence, the files themselves.
+    kind: "labels" for label maps of any size, whose boundaries are dilated; "masks" for masks of
+    the frames' size; "keypoints" for a Python file (`own_calls`) in place of the folder; "paths"
+    for a folder with a file of poses for each sequence.
+    name: used in the names of its runs; empty if there is only one source.
+    settings: how masks are made from label maps. invert: swap kept and ignored pixels of ready-made
+    masks.
+    """
+
+    folder: Path
+    kind: str = "labels"
+    name: str = ""
+    settings: MaskSettings = MaskSettings()
+    invert: bool = False
+
+    @property
+    def has_label_maps(self) -> bool:
+        """Whether masks are made from label maps."""
+        return self.kind == "labels"
+
+    @property
+    def has_width(self) -> bool:
+        """Whether its masks have a dilation width."""
+        return self.has_label_maps and self.settings.has_width
+
+    def masks(self, sequence: Sequence, dilation_width: int | None) -> FileMasks:
+        """Return the masks of a sequence. dilation_width: pixels, for masks with a width.
+
+        Raises InputError if a frame has no file.
+        """
+        if not self.has_label_maps:
+            return MaskFolder(self.folder, sequence, self.invert)
+        width = dilation_width if self.has_width else None
+        return LabelMasks(self.folder, sequence, width, self.settings)
+
+    def file(self, sequence: str) -> Path:
+        """Return the file of the keypoints, or of the path of a sequence."""
+        if self.kind == "keypoints":
+            return self.folder
+        return self.folder / f"{sequence}.txt"
+
+    def read(self, sequence: Sequence) -> odometry.Calls | np.ndarray:
+        """Return the `own_calls` of keypoints, or the `own_path` of a sequence."""
+        if self.kind == "keypoints":
+            return own_calls(self.folder)
+        return own_path(self.file(sequence.name), sequence)
+
+    def run(self, sequence: Sequence, settings: odometry.OdometrySettings) -> odometry.Result:
+        """Return the run with own keypoints, or a path as if it were a run."""
+        brought = self.read(sequence)
+        if isinstance(brought, odometry.Calls):
+            own_search = brought.find_essential_matrix is not odometry.OPENCV.find_essential_matrix
+            if own_search and hasattr(settings.estimator, "search"):
+                raise InputError(
+                    f"{self.folder}: find_essential_matrix would not be used, because this estimator has a "
+                    "search of its own; choose another --estimator"
+                )
+            return odometry.run(sequence, settings, calls=brought)
+        steps = [odometry.Step(index, pose=pose) for index, pose in enumerate(brought)]
+        return odometry.Result(brought, pd.DataFrame([step.row() for step in steps]))
+
+    def record(self, sequence: str) -> dict[str, str]:
+        """Return the digests and settings that the results of a sequence depend on."""
+        if self.kind in UNMASKED:
+            return {self.kind: provenance.digest_of_file(self.file(sequence))}
+        digest = provenance.digest_of_files(listed(folder_of_sequence(self.folder, sequence)))
+        if self.has_label_maps:
+            settings = {"settings": str(self.settings), **label_ids.record(self.settings.ids)}
+            return {self.kind: digest, **settings}
+        return {self.kind: digest, "invert": str(self.invert)}
+
+
+@cache
+def own_calls(path: Path) -> odometry.Calls:
+    """Return the odometry's calls with the functions that a Python file defines in their places.
+
+    Raises InputError if it defines none of them, and what its code raises. What its `detect` and
+    `track` return is checked in every frame.
+    """
+    defined = runpy.run_path(str(path))
+    own = {name: defined[name] for name in odometry.Calls._fields if name in defined}
+    if not own:
+        raise InputError(f"{path}: must define a function {' or '.join(odometry.Calls._fields)}")
+    if "detect" in own:
+        own["detect"] = _checked_detect(path, own["detect"])
+    if "track" in own:
+        own["track"] = _checked_track(path, own["track"])
+    return odometry.OPENCV._replace(**own)
+
+
+def _checked_detect(path: Path, detect: Callable) -> Callable:
+    """Return a detector that raises InputError for keypoints that are no (u, v) of the frame."""
+
+    def checked(frame: np.ndarray, settings: Any, mask: np.ndarray | None = None) -> np.ndarray:
+        points = detect(frame, settings, mask)
+        if _kind(points) != "float32" or points.ndim != 2 or points.shape[1] != 2:
+            raise InputError(
+                f"{path}: detect returned {_described(points)}; must be float32 (N, 2), (u, v) in pixels"
+            )
+        height, width = frame.shape
+        outside = ~((points >= -1) & (points <= [width, height])).all(axis=1)  # also NaN
+        if outside.any():
+            u, v = points[outside.argmax()]
+            raise InputError(
+                f"{path}: detect returned u {u:g}, v {v:g}, outside the frame of {width}x{height} pixels; "
+                "u is the column, v the row"
+            )
+        return points
+
+    return checked
+
+
+def _checked_track(path: Path, track: Callable) -> Callable:
+    """Return a tracker that raises InputError for anything but points and booleans."""
+
+    def checked(
+        previous: np.ndarray, current: np.ndarray, points: np.ndarray, settings: Any
+    ) -> tuple[np.ndarray, np.ndarray]:
+        try:
+            tracked, was_found = track(previous, current, points, settings)
+        except TypeError as error:
+            raise InputError(f"{path}: track: {error}") from None
+        is_right = _kind(tracked) in ("float32", "float64") and tracked.shape == points.shape
+        if not is_right or _kind(was_found) != "bool" or was_found.shape != points.shape[:1]:
+            raise InputError(
+                f"{path}: track returned {_described(tracked)} and {_described(was_found)}; must be "
+                f"float32 {points.shape} and bool {points.shape[:1]}, for as many points"
+            )
+        return tracked.astype(np.float32, copy=False), was_found
+
+    return checked
+
+
+def _kind(array: Any) -> str:
+    return str(getattr(array, "dtype", ""))
+
+
+def _described(array: Any) -> str:
+    """Such as "int64 (500, 2)"."""
+    if isinstance(array, np.ndarray):
+        return f"{array.dtype} {array.shape}"
+    return type(array).__name__
+
+
+def _try(path: Path, sequence: Sequence) -> None:
+    """Run own keypoints over three frames; raise InputError for whatever their code raises."""
+    try:
+        odometry.run(sequence.subset(3), calls=own_calls(path))
+    except (InputError, OSError):
+        raise
+    except Exception as error:
+        raise InputError(f"{path}: {cause(error)}") from error
+
+
+def own_path(path: Path, sequence: Sequence) -> np.ndarray:
+    """Return the path of another system, (n, 4, 4), metres, moved to where the odometry starts.
+
+    The file has poses with times, or one for each frame; those after the sequence's last frame are
+    left out. Raises InputError if a frame has no pose.
+    """
+    if have_times(path):
+        _, poses = read_poses_at(path, sequence.times)
+    else:
+        poses = read_poses(path)
+    # a study may use only the first frames
+    if len(poses) not in (len(sequence), len(images(sequence.frame_paths[0].parent))):
+        raise InputError(f"{path}: {len(poses)} poses for {len(sequence)} frames; each needs one")
+    return odometry.start_pose(sequence) @ np.linalg.inv(poses[0]) @ poses[: len(sequence)]
+
+
+def by_name(sources: Path | Iterable[Source]) -> dict[str, Source]:
+    """Return sources by name. A folder becomes a single source with an empty name."""
+    if isinstance(sources, Path):
+        sources = [Source(sources)]
+    return {source.name: source for source in sources}
+
+
+def named(
+    folders: Iterable[tuple[str, str | None, Path]],
+    settings: MaskSettings,
+    invert: bool = False,
+) -> tuple[Source, ...]:
+    """Return sources from (kind, name, folder). Without a name, that of the folder is used.
+
+    settings: for all masks from label maps; a folder of them may name its ids, as in FOLDER:train.
+    invert: for all ready-made masks.
+    Raises InputError for a name that cannot be a folder's name, and for equal names.
+    """
+    sources: list[Source] = []
+    for kind, given_name, folder in folders:
+        of_source = settings
+        path, colon, ids = str(folder).rpartition(":")
+        if colon and kind == "labels" and not folder.is_dir():  # a folder's name may have a colon
+            folder, of_source = Path(path), replace(settings, ids=ids)
+        if given_name is not None and not re.fullmatch(r"[\w+-]+( [\w+-]+)*", given_name):
+            raise InputError(
+                f"--{kind} {given_name}={folder}: a name has letters, digits, '_', '+', '-' and single "
+                "spaces between them"
+            )
+        folder_name = re.sub(r"[^\w+-]+", "-", folder.resolve().name).strip("-")
+        name = given_name or folder_name or "masks"
+        # some file systems ignore case
+        if name.lower() in [source.name.lower() for source in sources]:
+            raise InputError(
+                f"--{kind} {folder}: two sources would be called {name!r}; give one another name, "
+                f"--{kind} NAME={folder}"
+            )
+        sources.append(Source(folder.absolute(), kind, name, of_source, invert and kind == "masks"))
+    return tuple(sources)
+
+
+def check(
+    sources: Iterable[Source], sequences: Collection[Sequence], widths: Collection[int]
+) -> None:
+    """Raise InputError, before anything runs, if a source lacks files or has files of a wrong kind.
+
+    Each frame needs a file.
+    widths: pixels, for masks from label maps. Only the first file of each sequence is read here.
+    The runner reads all files, and a bad one stops only the runs that need it.
+    """
+    for source in sources:
+        kind = KINDS[source.kind]
+        if source.kind in UNMASKED:
+            for sequence in sequences:
+                source.read(sequence)
+            if source.kind == "keypoints":
+                _try(source.folder, next(iter(sequences)))
+            continue
+        if not source.folder.is_dir():
+            raise InputError(
+                f"{source.folder}: no such folder; it must hold a folder of {kind} for each sequence"
+            )
+        for sequence in sequences:
+            if (
+                len(sequences) > 1
+                and folder_of_sequence(source.folder, sequence.name) == source.folder
+            ):
+                raise InputError(
+                    f"{source.folder}: holds the {kind} of one sequence, but {len(sequences)} are "
+                    "asked for; put them into a folder for each, such as "
+                    f"{source.folder / sequence.name}, or name one with --sequences"
+                )
+            # raises InputError for a width that is too large for the frames
+            for width in widths or (1,):
+                paths = source.masks(sequence, width).paths
+            if source.has_label_maps:
+                label_ids.read(paths[0], source.settings.ids)
+            else:
+                read_mask(paths[0], sequence.size)

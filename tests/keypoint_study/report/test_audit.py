@@ -1,0 +1,289 @@
+"""The audit's rows and the measurements that are joined to them.
+
+Also the gap between domains, and the recorded trainings.
+"""
+
+from types import SimpleNamespace
+
+import made_up
+import numpy as np
+import pandas as pd
+import pytest
+
+from keypoint_study import compare
+from keypoint_study.report import style
+from thesis import (
+    ablations,
+    audit,
+    audit_of_data,
+    audit_of_tables,
+    domain_gap,
+    section_4_2,
+    trainings,
+)
+from thesis.settings import ROOT
+from thesis_repro.data.cityscapes import ID
+from thesis_repro.running import provenance
+
+
+def test_rows_are_numbered_and_every_measurement_has_a_row():
+    assert [int(row["row"]) for row in audit.ROWS] == list(range(1, len(audit.ROWS) + 1))
+    assert len(audit.ROWS) >= 85
+    assert all(
+        row[key].strip() for row in audit.ROWS for key in ("where", "does", "right", "switch")
+    )
+    with pytest.raises(KeyError, match="999"):
+        audit.table([audit.measurement("13", "spread", 1), audit.measurement("999", "spread", 1)])
+
+
+@pytest.mark.parametrize(
+    "row, quantity, metric, value",
+    [
+        ("1", "sum of eleven percentages", "RMSE", -13.2),
+        ("1", "mean of the percentages", "MAE", -2.33),
+        ("1", "median of the percentages", "RMSE", -5.27),
+        ("3", "reduction factor of keypoints, mean of Table 4.1", "", 2.626),
+        ("3", "reduction factor of keypoints, geometric mean over sequences", "", 2.689),
+        ("4", "sequences with a larger error", "MAE", 7),
+        ("41", "sequences improved", "RMSE", 6),
+        ("41", "sequences improved on average if masks did nothing", "RMSE", 10.3125),
+        (
+            "41",
+            "probability of no more improved sequences if masks did nothing, 15 independent widths",
+            "RMSE",
+            0.0335,
+        ),
+        ("60", "keypoints, means of Table 4.1", "", 761.7),
+    ],
+)
+def test_arithmetic_with_the_thesiss_tables(row, quantity, metric, value):
+    table = audit.table(audit_of_tables.of_reported(), "made up")
+    rows = table[
+        (table["row"] == row) & (table["quantity"] == quantity) & (table["metric"] == metric)
+    ]
+    assert rows["value"].item() == pytest.approx(value, abs=0.011)
+
+
+def test_alike_widths_count_as_one_and_unlike_ones_as_all():
+    random, widths = np.random.default_rng(0), 15
+    keys = pd.MultiIndex.from_product(
+        [map(str, range(400)), [0], range(1, widths + 1)],
+        names=["sequence", "repetition", "dilation_width"],
+    )
+    of_sequence = np.repeat(random.normal(size=400), widths)
+    level = pd.DataFrame({"sequence": keys.levels[0], "rmse": np.exp(2.0)})
+    for errors, expected in (
+        (of_sequence, 1),
+        (random.normal(size=len(keys)), widths),
+        (of_sequence + random.normal(size=len(keys)), widths / (1 + (widths - 1) / 2)),
+    ):
+        masked = pd.DataFrame({"rmse": np.exp(2 + errors)}, keys).reset_index()
+        _, number = section_4_2.independent_widths(masked, level, "rmse")
+        assert number == pytest.approx(expected, rel=0.15)
+
+
+@pytest.mark.parametrize("folder", ["figures", "figures/kitti_excerpts"])
+def test_the_audit_has_the_times_of_the_budget_beside_it(folder):
+    rows = pd.read_csv(ROOT / folder / "audit.csv", dtype={"row": str})
+    budget = pd.read_csv(ROOT / folder / "budget.csv", index_col="stage")
+    stages = [stage for stage in budget.index if not stage.startswith(("all", "frames"))]
+    named = rows[rows["row"] == "49"].set_index("metric")["value"].add_suffix(" (ms)")
+    masked = budget["masked, width 10"]
+    assert named[stages].to_numpy() == pytest.approx(masked[stages].to_numpy(), abs=0.006)
+    (whole,) = rows.loc[rows["row"] == "16", "value"]
+    every = budget.loc[stages, "all keypoints"].sum()
+    assert whole == pytest.approx(masked[stages].sum() / every, rel=2e-3)
+
+
+def test_rows_without_a_measurement_stay_and_words_appear_once():
+    measurements = [
+        audit.measurement("13", "spread", [1, 2, 3]),
+        audit.measurement("13", "spread", 5),
+    ]
+    table = audit.table(measurements, "made up")
+    assert list(dict.fromkeys(table["row"])) == [row["row"] for row in audit.ROWS]
+    lines = table[table["row"] == "13"]
+    assert (
+        lines["value"].tolist() == [2, 5]
+        and lines["n"].tolist() == [3, 1]
+        and set(lines["data"]) == {"made up"}
+    )
+    assert lines["where"].iloc[0] and not lines["where"].iloc[1]
+
+
+def test_ablations_become_ratios_of_their_reference():
+    factors = {
+        "baseline": 1.0,
+        "masked": 0.5,
+        "nearest": 0.25,
+        "strongest-100": 4.0,
+        "dropout": 1.0,
+    }
+    runs = made_up.runs(
+        [f"{number:02d}" for number in range(8)],
+        lambda _, method, __: factors[method],
+        dict.fromkeys(factors, [None]),
+        estimators=ablations.ESTIMATORS,
+        noise=0.02,
+    )
+    runs = runs.assign(failed=1.0, across=0.1, down=0.2, sim3=runs["rmse"])
+    measurements = pd.DataFrame(audit_of_tables.of_ablations(runs))
+    ratios = measurements[measurements["unit"] == "ratio"].set_index(
+        ["row", "metric", "estimator"]
+    )["value"]
+    assert (
+        ratios["10", "RMSE", "refined"] == pytest.approx(0.5, rel=0.05)
+        and ratios["10", "keypoints", ""] == 1
+    )
+    assert ratios["59", "RMSE", "thesis"] == pytest.approx(1, rel=0.05)
+    assert set(measurements["frames"]) == {100}
+    assert not measurements["row"].isin(["48"]).any()  # ORB was not run
+
+
+def test_other_tables_are_measured_by_sequence_with_their_number_of_frames():
+    shares = pd.DataFrame(
+        {
+            "sequence": ["00", "00", "01"],
+            "frame": [0, 5, 0],
+            "lost": [10.0, 30.0, 40.0],
+            "road/sidewalk": [np.nan, np.nan, 60.0],
+            "building/fence": np.nan,
+        }
+    )
+    rows = audit_of_tables.of_shares(shares)
+    assert {(row["quantity"], row["value"], row["n"], row["frames"]) for row in rows} == {
+        ("boundary pixels lost", 30, 2, 2),
+        ("boundary pixels lost, road/sidewalk", 60, 1, 2),
+    }
+    tracks = pd.DataFrame(
+        {
+            "sequence": ["00"] * 4,
+            "frame": [0, 0, 3, 3],
+            "method": ["all keypoints", "masks"] * 2,
+            "residual": [1.0, 2.0, 1.0, 8.0],
+        }
+    )
+    (row,) = audit_of_tables.of_tracks(tracks)
+    assert (row["row"], row["frames"], row["n"]) == ("32", 2, 1) and row["value"] == pytest.approx(
+        4
+    )
+
+
+def test_clear_effects_are_ratios_of_errors_whose_intervals_exclude_1():
+    measurements = [
+        audit.ratio("10", "clear", [0.5, 0.6] * 3, metric="RMSE"),
+        audit.ratio("10", "unclear", [0.5, 2, 0.9, 1.1, 0.8, 1.2], metric="RMSE"),
+        audit.ratio("10", "no error", [0.5, 0.6] * 3, metric="keypoints"),
+        audit.ratio("14", "never below 1", [1.5, 1.6] * 3, metric="RMSE"),
+    ]
+    assert list(audit.clear_effects(audit.table(measurements))["quantity"]) == ["clear"]
+
+
+def test_right_pixels_are_counted_by_area():
+    exact = np.full((20, 60), ID["road"], np.uint8)
+    exact[5:10, 20:30] = ID["pole"]
+    frame = np.full(exact.shape, 100, np.uint8)
+    frame[15:, :30] = 50  # shadow
+    predicted = exact.copy()
+    predicted[15:, :15] = ID["car"]  # half of the shadow
+    predicted[5:10, 20:22] = ID["car"]  # a fifth of the pole
+    shares = audit_of_data.right_shares(predicted, exact, frame)
+    assert shares["small"] == 80 and shares["dark"] == 50 and shares["lit"] == 100
+    assert shares["large"] == pytest.approx(100 * (1 - 75 / 1150))
+    assert shares["inside"] > shares["rim"]
+    assert "small" not in audit_of_data.right_shares(predicted, np.full_like(exact, 7), frame)
+
+
+def test_the_audit_and_the_comparison_answer_a_question_with_the_same_number():
+    methods = {"baseline": 1.0, "masked": 0.5, "fewer": 2.0, "corrected": 0.8}
+    runs = made_up.runs(
+        [f"{number:02d}" for number in range(8)],
+        lambda _, method, __: methods[method],
+        {"baseline": [None], "masked": [5, 10], "fewer": [10], "corrected": [10]},
+        noise=0.3,
+    )
+    table = compare.comparisons(runs)
+    compared = table[table["tested"] & (table["reference"] == "baseline")].set_index(
+        ["method", "estimator", "metric"]
+    )
+    audited = pd.DataFrame(audit_of_tables.of_study(runs, runs[runs["method"] == "baseline"]))
+    assert len(audited[audited["row"] == "39"]) == 3
+    for row, method in (("15", "masked"), ("40", "fewer"), ("50", "corrected")):
+        lines = audited[(audited["row"] == row) & (audited["metric"] == "RMSE")]
+        for line in lines[lines["quantity"].str.endswith("over all keypoints")].itertuples():
+            assert [line.value, line.low, line.high, line.n] == pytest.approx(
+                compared.loc[(method, line.estimator, "rmse"), ["ratio", "low", "high", "n"]]
+            )
+        assert len(lines) >= 2
+
+
+# The gap between domains, on made-up scores
+
+OWN, SHIPPED = "the model of this run", "the model in the package"
+VALIDATION, STREETS = "validation images", "KITTI's street scenes"
+
+
+# of two models on two domains; the second domain of the first model has no sky
+SCORES = pd.DataFrame(
+    [
+        (OWN, VALIDATION, 20, 2, 0.6, 0.9),
+        (OWN, STREETS, 7, 1, 0.3, float("nan")),
+        (SHIPPED, VALIDATION, 20, 2, 0.5, 0.8),
+        (SHIPPED, STREETS, 7, 2, 0.4, 0.7),
+    ],
+    columns=["model", "domain", "images", "classes", "mean_iou", "sky_recall"],
+).assign(accuracy=0.7)
+SCORES["IoU: road"] = 0.8
+SCORES["IoU: sky"] = [0.7 if row.classes == 2 else float("nan") for row in SCORES.itertuples()]
+
+
+def test_the_table_shows_each_model_and_domain():
+    table = domain_gap.table(SCORES).set_index("measure")
+    assert list(table) == [
+        f"{OWN}: {VALIDATION}",
+        f"{OWN}: {STREETS}",
+        f"{SHIPPED}: {VALIDATION}",
+        f"{SHIPPED}: {STREETS}",
+    ]
+    scores = table[f"{OWN}: {VALIDATION}"]
+    assert scores[["images", "classes present", "mean IoU over these", "IoU: sky"]].tolist() == [
+        20,
+        2,
+        0.6,
+        0.7,
+    ]
+    assert pd.isna(table.loc["IoU: sky", f"{OWN}: {STREETS}"])
+    assert table.index.is_unique
+
+
+def test_the_quality_of_label_maps_is_recorded(tmp_path):
+    assert domain_gap.label_map_quality(tmp_path).empty
+    style.save_table(
+        SCORES.assign(used=SCORES["model"] == SHIPPED), tmp_path, domain_gap.RECORD, "note"
+    )
+    rows = domain_gap.label_map_quality(tmp_path).to_dict("records")
+    assert [
+        (row["domain"], row["mean_iou"], row["classes"], row["images"], row["seen"]) for row in rows
+    ] == [(VALIDATION, 0.5, 2, 20, False), (STREETS, 0.4, 2, 7, True)]
+
+
+# A run is told whether its network is the recorded one
+
+RECORDED = trainings.read()["network"].iloc[0]
+
+
+@pytest.mark.parametrize(
+    "network, in_git, named",
+    [
+        (RECORDED, True, [RECORDED]),
+        ("0" * 12, True, [RECORDED, "0" * 12, "trainings.csv"]),
+        ("0" * 12, False, []),
+        (None, True, []),
+    ],
+)
+def test_the_networks_are_compared(tmp_path, network, in_git, named):
+    if network:
+        provenance.stage(tmp_path / "labels" / "00", model=network)
+    note = trainings.network_note(SimpleNamespace(build=tmp_path, figures_in_git=in_git))
+    assert bool(note) == bool(named) and all(name in note for name in named)
+    assert ("XLA_FLAGS" in note) == (len(named) > 1)

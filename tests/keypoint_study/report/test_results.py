@@ -1,0 +1,427 @@
+"""Figures and tables of chapter 4, the comparison and the findings show the numbers of the runs."""
+
+from html import escape
+from types import SimpleNamespace
+
+import made_up
+import matplotlib.pyplot as plt
+import numpy as np
+import pandas as pd
+import pytest
+from cells import cells
+from drawn import problems
+from matplotlib.container import BarContainer
+
+from keypoint_study import compare
+from keypoint_study.jobs import ESTIMATORS
+from keypoint_study.report import comparison, findings, html, study_report, style, texts
+from thesis import chapter4, few_keypoints, frames, section_4_2
+from thesis.captions import REPORTED
+from thesis_repro.errors import one_line
+
+AHEAD = np.array([[0, 0, z] for z in range(4)])  # true positions, metres
+ELEVEN = [f"{number:02d}" for number in range(11)]
+CONTROLS = compare.SEGMENTATION_FREE_CONTROLS
+NEVER_SHUFFLED = made_up.runs(
+    ["00"], lambda *_: 1.0, {"baseline": [None]}, estimators=["thesis"], repetitions=1
+)
+
+
+def best_of(runs):
+    return section_4_2.of_chosen_width(compare.of_method(runs, "masked"))
+
+
+def runs_of(names, errors, widths=(5, 10, 15), **options):
+    methods = {"baseline": [None], "reduced": [None], "masked": widths} | {
+        name: [10] for name in CONTROLS
+    }
+    return made_up.runs(names, errors, methods, **options)
+
+
+def widths_of(runs):
+    """The runs with masks and with all keypoints, as notebook 8 selects them."""
+    return compare.of_method(runs, "masked"), compare.of_method(runs, "baseline")
+
+
+def halved(name, method, _):
+    """Errors that masks halve and controls do not."""
+    return (0.5 if method == "masked" else 1.0) * (1 + int(name) / 10)
+
+
+@pytest.mark.parametrize(
+    "metric, key, total, mean, median, improved",
+    [
+        ("rmse", "table_4_2_rmse_percent_change", -13.2, -1.2, -5.27, 6),
+        ("mae", "table_4_3_mae_percent_change", -25.65, -2.33, 1.76, 4),
+    ],
+)
+def test_tables_of_the_thesiss_numbers_equal_the_thesiss(
+    metric, key, total, mean, median, improved
+):
+    reported = REPORTED[key]
+    runs = runs_of(
+        list(reported),
+        lambda name, method, width: (
+            2.0
+            if method == "baseline"
+            else 2 * (1 + reported[name] / 100) + {5: 0.5, 15: 1.0}.get(width, 0)
+        ),
+    )
+    table = section_4_2.table_of_change(
+        *widths_of(runs), NEVER_SHUFFLED, metric, "thesis"
+    ).set_index("sequence")
+    changes = [column for column in table if column.startswith("change")]
+    assert len(changes) == 3  # no column for masks that did nothing
+    for column in changes:
+        assert table.loc["sum (the thesis's aggregate)", column] == pytest.approx(total, abs=0.06)
+        assert table.loc[["mean", "median"], column].tolist() == pytest.approx(
+            [mean, median], abs=0.05
+        )
+        assert table.loc["sequences improved", column] == improved
+    widths = section_4_2.table_4_1(widths_of(runs)[0], "thesis")
+    assert set(widths["dilation width (pixels)"]) == {10} and widths["width, thesis"].tolist()[
+        :2
+    ] == [10, 11]
+
+
+def test_the_literal_procedure_is_that_of_repetition_0():
+    runs = runs_of(["00"], lambda *_: 1.0)
+    masked = (runs["estimator"] == "thesis") & (runs["method"] == "masked")
+    # the mean is lowest at width 10, repetition 0 at width 5
+    for width, errors in ((5, [0.6, 3, 3]), (10, [0.7, 0.1, 0.1]), (15, [1, 1, 1])):
+        runs.loc[masked & (runs["dilation_width"] == width), "rmse"] = errors
+    shown = section_4_2.table_of_change(*widths_of(runs), NEVER_SHUFFLED, "rmse", "thesis").iloc[0]
+    assert shown["change (%)"] == pytest.approx(-70)
+    assert shown["change (%), one run each"] == pytest.approx(-40)
+
+
+def test_masks_that_do_nothing_are_told_beside_the_literal_procedure():
+    runs = runs_of(ELEVEN, lambda *_: 1.0, noise=0.2)
+    baseline = {"baseline": [None]}
+    options = {"estimators": ["thesis"], "repetitions": 30, "noise": 0.2}
+    shuffled = made_up.runs(ELEVEN, lambda *_: 1.0, baseline, **options)
+    table = section_4_2.table_of_change(*widths_of(runs), shuffled, "rmse", "thesis").set_index(
+        "sequence"
+    )
+    studies = section_4_2.null_distribution(shuffled, 3, "rmse")
+    null = table["change (%), one run each, if masks did nothing"]
+    assert null["mean"] == pytest.approx(studies.mean(axis=1).mean(), abs=0.006)
+    assert null["mean"] < -5 and null["sequences improved"] > 6  # the best of three widths
+    of_rmse, _ = section_4_2.procedure(runs, shuffled).to_dict("records")
+    assert of_rmse["null_mean"] == pytest.approx(null["mean"], abs=0.006)
+    assert of_rmse["lowest"] < of_rmse["highest"] and of_rmse["repetitions"] == 3
+    once = runs[(runs["repetition"] == 0) | (runs["dilation_width"] != 5)]  # width 5 is run once
+    assert section_4_2.procedure(once, shuffled)["repetitions"][0] == 1
+
+
+def test_failed_runs_are_counted():
+    runs = runs_of(ELEVEN, halved)
+    failing = (runs["sequence"] == "03") & (runs["method"] == "masked")
+    runs.loc[failing & (runs["repetition"] == 0), "failed"] = 5.0
+    table = section_4_2.table_of_change(
+        *widths_of(runs), NEVER_SHUFFLED, "rmse", "thesis"
+    ).set_index("sequence")
+    assert table.loc["03", "failed runs, best mask"] == "1 of 3"
+    for column in ("change (%)", "change (%), one run each"):
+        assert table.loc["03", column] < 0 and table.loc["sequences improved", column] == 11
+    assert (
+        section_4_2.table_4_1(widths_of(runs)[0], "thesis")
+        .set_index("sequence")
+        .loc["03", "failed runs"]
+        == "1 of 3"
+    )
+    compared = comparison.table_comparison(compare.comparisons(runs))
+    of_masks = compared[(compared["keypoints"] == "masks, width 10")].iloc[0]
+    assert (
+        of_masks["failed runs"] == "1 of 33"
+        and of_masks["failed runs of the reference"] == "0 of 33"
+    )
+    assert (
+        comparison.table_widths(runs).set_index("sequence").loc["failed runs"].iloc[4] == "1 of 33"
+    )
+
+
+def test_errors_are_means_with_their_spread_and_the_lowest_is_bold():
+    runs = runs_of(ELEVEN, halved, noise=0.2)
+    table = comparison.table_errors(compare.comparisons(runs), runs)
+    methods = ["all keypoints", "masks, width 10", *(compare.METHODS[name] for name in CONTROLS)]
+    assert list(table["method"]) == 4 * methods and list(table.columns[3:]) == ELEVEN
+    assert list(table["estimator"].unique()) == ["vote of all points", "refined estimator"]
+    assert list(table["error"].unique()) == ["aligned ATE (m)", "rotational RPE, 1 frame (deg)"]
+    masked = (runs["method"] == "masked") & (runs["dilation_width"] == 10)
+    errors = runs[masked & (runs["estimator"] == "refined") & (runs["sequence"] == "03")]["se3"]
+    cell = table[table["estimator"] == "refined estimator"].set_index("method").iloc[1]["03"]
+    mean, spread = map(float, cell.strip("*").split(" ± "))
+    assert (mean, spread) == pytest.approx((errors.mean(), errors.std()), abs=0.00051)
+    bold = table[ELEVEN].map(lambda cell: cell.startswith("**"))
+    of_masks = bold[table["method"] == "masks, width 10"]
+    assert (bold.sum() == 4).all() and of_masks.to_numpy().mean() > 0.9
+    pieces = study_report.latex_errors(table).split("\\end{tabular}")[:-1]
+    assert len(pieces) == 12 and all("{lllll}" in piece or "{llll}" in piece for piece in pieces)
+    assert sum(piece.count("\\textbf{") for piece in pieces) == 44
+    paths = runs[runs["method"] == "baseline"].assign(method="paths", source="slam")
+    beside = pd.concat([runs_of(ELEVEN, halved, noise=0.2, sources=("net",)), paths])
+    shown = comparison.table_errors(compare.comparisons(beside), beside)
+    assert len(shown) == len(table) + 4 and "slam" in set(shown["method"])
+    once = runs[runs["repetition"] == 0]
+    single = comparison.table_errors(compare.comparisons(once), once)
+    assert not single[ELEVEN].map(lambda cell: "±" in cell).any(axis=None)
+
+
+def test_deviations_of_zero_are_a_note_below_the_table():
+    runs = runs_of(ELEVEN[:5], halved)
+    refined = runs["estimator"] == "refined"
+    runs.loc[~refined, "se3"] *= 1 + 0.1 * runs["repetition"]
+    table = comparison.table_errors(compare.comparisons(runs), runs)
+    has_deviation = table[ELEVEN[:5]].map(lambda cell: "±" in cell).all(axis=1)
+    varied = (table["error"] == "aligned ATE (m)") & (table["estimator"] == "vote of all points")
+    assert has_deviation.equals(varied) and varied.any()
+    text = study_report.latex_errors(table, 3)
+    assert "0.0000" not in text and text.count(study_report.NO_DEVIATION) == 6  # of 8 tables
+    assert study_report.NO_DEVIATION not in study_report.latex_errors(table)
+
+
+def test_failures_of_the_other_estimator_stand_in_the_summary():
+    runs = runs_of(ELEVEN, halved)
+    failing = (runs["method"] == "masked") & (runs["estimator"] == "thesis")
+    runs.loc[failing & (runs["dilation_width"] == 10), "failed"] = 5.0
+    (row,) = comparison.table_summary(compare.comparisons(runs)).to_dict("records")
+    assert row["estimator"] == "refined estimator"
+    assert row["failed runs"] == "0 of 33; thesis's estimator 33 of 33"
+    assert row["failed runs of the reference"] == "0 of 33; thesis's estimator 0 of 33"
+
+
+def test_ratios_in_the_tables_equal_the_comparison():
+    runs = runs_of(ELEVEN, halved, noise=0.2)
+    table = compare.comparisons(runs)
+    shown = comparison.table_comparison(table)
+    assert len(shown) == 2 * (1 + 2 * len(CONTROLS))
+    of_rmse = table[table["tested"] & (table["method"] != "baseline") & (table["metric"] == "rmse")]
+    for row in of_rmse[of_rmse["reference"] == "baseline"].itertuples():
+        cell = shown[
+            (shown["estimator"] == ESTIMATORS[row.estimator])
+            & (shown["over"] == "all keypoints")
+            & shown["keypoints"].str.startswith(compare.METHODS[row.method])
+        ]["RMSE"].iloc[0]
+        ratio, low, high = map(
+            float, cell.replace("(", "").replace(")", "").replace("-", " ").split()
+        )
+        assert (ratio, low, high) == pytest.approx((row.ratio, row.low, row.high), abs=0.0051)
+    widths = comparison.table_widths(runs).set_index("sequence")
+    expected = compare.ratios(best_of(runs), compare.of_method(runs, "baseline"), "rmse")
+    assert widths.loc[ELEVEN, "best width: RMSE"].astype(float).to_numpy() == pytest.approx(
+        expected, abs=0.0051
+    )
+    unknown = runs_of(["77"], lambda *_: 1.0)  # a sequence that the thesis does not have
+    assert np.isnan(
+        section_4_2.table_of_change(*widths_of(unknown), NEVER_SHUFFLED, "rmse", "thesis").loc[
+            0, "change (%), thesis"
+        ]
+    )
+    assert pd.isna(section_4_2.table_4_1(widths_of(unknown)[0], "thesis").loc[0, "width, thesis"])
+
+
+@pytest.mark.parametrize(
+    "value, text",
+    [
+        (1.09, "1.09"),
+        (1.0018, "1.0018"),
+        (0.9951, "0.9951"),
+        (1.0, "1.00"),
+        (0.0041, "0.0041"),
+        (-0.004, "-0.0040"),
+        (0.0, "0.00"),
+        (float("nan"), "nan"),
+    ],
+)
+def test_a_ratio_near_zero_or_one_has_more_digits(value, text):
+    assert texts.number(value) == text
+
+
+@pytest.mark.parametrize(
+    "errors, names, verdict",
+    [
+        (halved, ELEVEN, compare.LOWER),
+        (lambda *of: 1 / halved(*of), ELEVEN, compare.HIGHER),
+        (lambda *_: 1.0, ELEVEN[:6], compare.NO_CLEAR_DIFFERENCE),
+        (halved, ["00", "05"], compare.TOO_FEW),
+    ],
+)
+@pytest.mark.parametrize("sources", [("",), ("net", "hand")])
+def test_findings_follow_the_verdict(errors, names, verdict, sources):
+    runs = runs_of(names, errors, noise=0.02, sources=sources)
+    table = compare.comparisons(runs)
+    is_primary = (
+        table["decides"] & (table["method"] == "masked") & (table["reference"] == "baseline")
+    )
+    primary = table[is_primary]
+    for source in sources:
+        assert compare.overall(primary.loc[primary["source"] == source, "verdict"]) == verdict
+    text = findings.text(runs, table, "KITTI folder embedded, made up", False)
+    assert text.count(f"{findings.OUTCOMES[verdict]} here.**") == len(sources)
+    summary = comparison.table_summary(table).set_index("source")
+    for source in sources:
+        for row in primary[primary["source"] == source].to_dict("records"):
+            assert f"| {texts.ratio(row)} |" in text
+            cell = summary.loc[source, compare.METRICS[row["metric"]]]
+            assert texts.ratio(row).replace("95 % CI ", "") == cell
+        assert summary.loc[source, "verdict"] == verdict
+
+
+@pytest.mark.parametrize("estimators", [["thesis"], ["inliers", "thesis"], ["thesis", "refined"]])
+def test_findings_say_if_the_estimator_that_usually_decides_was_not_run(estimators):
+    runs = runs_of(ELEVEN[:6], halved, estimators=estimators)
+    text = findings.text(runs, compare.comparisons(runs), "made up", False)
+    (first, usual) = (ESTIMATORS[name] for name in (estimators[0], "refined"))
+    said = f"The {usual}, which usually decides, was not run. So the {first} decides"
+    assert (said in text) == ("refined" not in estimators)
+
+
+def drawn_by_cells(runs):
+    """{name: figure} of the cells of notebook 8 that draw widths and methods."""
+    figures = {}
+    save = SimpleNamespace(save_figure=lambda figure, name, note: figures.update({name: figure}))
+    given = {"runs": runs, "SEQUENCES": sorted(runs["sequence"].unique()), "note": ""}
+    modules = {"np": np, "pd": pd, "chapter4": chapter4, "frames": frames, "style": style}
+    modules |= {"section_4_2": section_4_2, "compare": compare}
+    names = given | modules | {"artefacts": save}
+    for number in ("58", "54", "18", "55", "56", "26", "27"):
+        exec(cells("08_results.ipynb", "code")[f"08-{number}"], names)
+    return figures
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "names, noise, sources",
+    [
+        (["00"], 0, ("",)),
+        (["00", "05", "06"], 0, ("net", "by hand")),
+        (ELEVEN, 0.9, ("",)),
+        (["00", "05"], 0.9, ("",)),
+    ],
+)
+def test_figures_of_equal_and_of_noisy_errors_can_be_drawn(names, noise, sources):
+    runs = runs_of(names, lambda *_: 0.1, noise=noise, sources=sources)
+    table = compare.comparisons(runs)
+    if sources == ("",):
+        assert problems(chapter4.figure_against_width(*widths_of(runs), "rmse")) == []
+        figures = drawn_by_cells(runs)
+        assert set(figures) == {f"figure_4_{number:02d}" for number in (7, 13, 14, 15, 16)}
+        assert [name for name, figure in figures.items() if problems(figure)] == []
+    figure = comparison.figure_comparison(table)
+    figure.draw_without_rendering()
+    assert all(edge > 0 for axes in figure.axes for edge in axes.get_xlim())
+
+
+def test_the_comparison_figure_shows_ratios_and_their_interval():
+    lower = runs_of(ELEVEN, lambda name, method, _: 0.7 + 0.3 * (method != "masked"), noise=0.1)
+    table = compare.comparisons(lower)
+    axes = comparison.figure_comparison(table).axes[0]
+    row = table[
+        (table["estimator"] == "thesis")
+        & (table["metric"] == list(compare.JUDGING_METRICS)[0])
+        & table["tested"]
+        & (table["method"] == "masked")
+        & (table["reference"] == "baseline")
+    ].iloc[0]
+    dots, interval, marker = axes.lines[:3]
+    assert dots.get_xdata() == pytest.approx(row[ELEVEN].astype(float).to_numpy())
+    assert interval.get_xdata() == pytest.approx([row["low"], row["high"]])
+    assert marker.get_xdata() == pytest.approx([row["ratio"]])
+    # so that the ends of an interval shorter than the marker are seen
+    assert interval.get_markersize() > 1.5 * marker.get_markersize()
+
+
+def test_the_curve_of_few_keypoints_shows_every_ratio():
+    rows = [
+        {"choice": choice, "number": number, "keypoints": number or 1900, "estimator": estimator}
+        | {"error": error, "ratio": 2.0, "low": 0.3, "high": 90.0 if number == 50 else 3.0}
+        for choice, number in (("all", 0), ("strongest", 50), ("strongest", 400))
+        for estimator in few_keypoints.ESTIMATORS
+        for error in few_keypoints.ERRORS
+    ]
+    times = pd.DataFrame({"choice": ["all"], "number": [0], "milliseconds": [50.0]})
+    figure = few_keypoints.figure(pd.DataFrame(rows), times)
+    assert problems(figure) == []
+    wide, enlarged = figure.axes[0:2] + figure.axes[4:6], figure.axes[2:4] + figure.axes[6:8]
+    for panel in wide:
+        low, high = panel.get_ylim()
+        assert low < 0.3 and high > 90
+    assert [panel.get_ylim() for panel in enlarged] == [few_keypoints.NEAR] * 4
+
+
+def test_the_figure_of_paths_shows_repetitions_and_their_errors():
+    runs = compare.of_method(runs_of(["00", "05"], lambda *_: 1.0), "baseline")
+    paths = {
+        (row.sequence, row.run): AHEAD + [[0, 0, 0], [0, 0, 0], [row.repetition, 0, 0], [3, 4, 0]]
+        for row in runs.itertuples()
+    }
+    figure = chapter4.figure_paths({"00": AHEAD, "05": AHEAD}, runs[::-1], paths)
+    true, *lines = figure.axes[0].lines
+    assert len(lines) == 3 and len(figure.axes) == 4
+    assert all(lines[0].get_linewidth() > line.get_linewidth() for line in lines[1:])
+    distances = [line.get_ydata().tolist() for line in figure.axes[2].lines]
+    assert distances == [[0, 0, 0, 5], [0, 0, 1, 5], [0, 0, 2, 5]]
+
+
+@pytest.mark.parametrize("failed", [0, 1])
+def test_a_failed_run_is_marked_where_runs_are_drawn(failed):
+    runs = runs_of(["00", "05"], lambda *_: 1.0, noise=0.1)
+    rows = (runs["method"] == "baseline") & (runs["sequence"] == "05")
+    masked_rows = (runs["method"] == "masked") & (runs["sequence"] == "05")
+    runs.loc[(rows | masked_rows) & (runs["repetition"] == 1), "failed"] = 50.0 * failed
+    of_all = compare.of_method(runs, "baseline")
+    paths = {(row.sequence, row.run): AHEAD for row in of_all.itertuples()}
+    truths = {"00": AHEAD, "05": AHEAD}
+    for figure in (
+        chapter4.figure_paths(truths, of_all, paths),
+        chapter4.figure_against_width(*widths_of(runs), "rmse"),
+        *(figure for name, figure in drawn_by_cells(runs).items() if name != "figure_4_07"),
+    ):
+        crosses = [line for line in figure.findobj(plt.Line2D) if line.get_marker() == "x"]
+        words = [text.get_text() for text in figure.findobj(plt.Text)]
+        assert bool(crosses) == bool(failed) and words.count("failed run") == failed
+
+
+def test_bars_show_the_mean_of_each_method_and_its_repetitions():
+    runs = runs_of(["00", "05"], lambda *_: 1.0, noise=0.3)
+    spread = compare.spread(compare.of_method(runs, "baseline"), "rmse")
+    axes = drawn_by_cells(runs)["figure_4_13"].axes[0]
+    bars = next(each for each in axes.containers if isinstance(each, BarContainer))
+    assert [bar.get_height() for bar in bars] == pytest.approx(spread["mean"].tolist())
+    whiskers = bars.errorbar.lines[2][0].get_segments()
+    ends = [segment[:, 1].tolist() for segment in whiskers]
+    assert np.array(ends) == pytest.approx(spread[["lowest", "highest"]].to_numpy())
+
+
+HOSTILE = [
+    "![a](http:x.png)",
+    "![a][b]",
+    "[a](http:x)",
+    "__a__",
+    "*a*",
+    "`a`",
+    "a|b",
+    "<img src=x>",
+    "a\\|b",
+    "~~a~~",
+    "=1+1",
+    "NA",
+    "007",
+    "caf\udce9",
+    "a\nb\r\x1b",
+]
+
+
+def test_names_stay_names_in_texts_and_tables(tmp_path):
+    shown = [escape(one_line(name)) for name in HOSTILE]
+    rows = pd.DataFrame({"sequence": HOSTILE, "masks": HOSTILE, "ate": -1.0})
+    style.save_table(rows, tmp_path, "table", HOSTILE[0])
+    read = html.from_markdown((tmp_path / "table.md").read_text(encoding="utf-8"))
+    assert read.count("<td") == 3 * len(HOSTILE) and f"<p>{shown[0]}</p>" in read
+    assert all(read.count(f">{name}</td>") == 2 for name in shown)
+    # a spreadsheet must not calculate with it, and the page shows it as it is in the file
+    table = pd.read_csv(tmp_path / "table.csv", dtype=str, keep_default_na=False)
+    in_file = [name.encode(errors="backslashreplace").decode() for name in HOSTILE]
+    in_file[HOSTILE.index("=1+1")] = "'=1+1"
+    assert list(table["sequence"]) == list(table["masks"]) == in_file

@@ -1,0 +1,181 @@
+"""Controls, ablations, the null distribution of the thesis's procedure, tracks and boundaries."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from keypoint_study import compare, controls, methods, runner
+from keypoint_study.jobs import first_jobs
+from keypoint_study.sources import Source
+from thesis import ablations, section_4_2
+from thesis_repro import masks
+from thesis_repro.data.kitti import Sequence
+from thesis_repro.masks import folders
+from thesis_repro.odometry import THESIS, keypoints
+from thesis_repro.odometry.loop import detect
+
+WIDTH = 10
+
+
+@pytest.fixture(scope="module")
+def sequence(small_world):
+    return Sequence(small_world / "kitti", "00")
+
+
+@pytest.fixture(scope="module")
+def made(sequence, small_labels):
+    """Masks of every control and of the thesis, by method."""
+    source = Source(small_labels)
+    by_method = {"masked": folders.LabelMasks(small_labels / "00", sequence, WIDTH)}
+    for method in methods.MASK_CONTROLS:
+        _, by_method[method] = methods.METHODS[method].choose(sequence, source, WIDTH)
+    return by_method
+
+
+def test_masks_of_controls_are_valid_and_repeatable(sequence, made):
+    for method, source in made.items():
+        assert len(source) == len(sequence)
+        mask = source[3]
+        assert mask.shape == sequence.size and mask.dtype == np.uint8, method
+        assert set(np.unique(mask)) == {0, 255}, method
+        assert mask.flags.c_contiguous, method
+        source[7]
+        assert np.array_equal(source[3], mask), method
+        is_thesis_mask = np.array_equal(mask, made["masked"][3])
+        assert is_thesis_mask == (method == "masked"), method
+
+
+def test_controls_use_the_frame_and_settings_of_their_name(
+    sequence, small_world, small_labels, made
+):
+    for index, other in ((0, 6), (5, 11), (6, 0), (11, 5)):
+        assert np.array_equal(made["other-frame"][index], made["masked"][other])
+        assert np.array_equal(made["mirrored"][index], cv2.flip(made["masked"][index], 1))
+    predicted = cv2.imread(str(small_labels / "00" / "000005.png"), cv2.IMREAD_GRAYSCALE)
+    true = cv2.imread(
+        str(small_world / "kitti/sequences/00/labels_0/000005.png"), cv2.IMREAD_GRAYSCALE
+    )
+    for method, label_map, settings in (
+        ("true-labels", true, masks.MaskSettings()),
+        ("exact-boundaries", predicted, masks.MaskSettings("exact")),
+        ("corrected", predicted, masks.MaskSettings("exact", symmetric=True, movable=2, margin=10)),
+    ):
+        expected = masks.keypoint_mask(label_map, sequence.size, WIDTH, settings)
+        assert np.array_equal(made[method][5], expected), method
+
+
+def test_random_lines_and_image_edges_cover_as_much_as_the_mask(sequence, made):
+    for index in range(12):
+        expected = masks.coverage(made["masked"][index])
+        assert 0.05 < expected < 0.95
+        assert masks.coverage(made["random-lines"][index]) == pytest.approx(expected, abs=0.01)
+        assert masks.coverage(made["image-edges"][index]) == pytest.approx(expected, abs=0.01)
+    assert not np.array_equal(made["random-lines"][0], made["random-lines"][1])
+    # segments are dilated like boundaries, so opening changes only the border
+    mask = made["random-lines"][2]
+    opened = cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((WIDTH - 1, WIDTH - 1), np.uint8))
+    assert np.array_equal(opened[WIDTH:-WIDTH, WIDTH:-WIDTH], mask[WIDTH:-WIDTH, WIDTH:-WIDTH])
+    dx, dy = cv2.spatialGradient(sequence.frame(3))
+    strength = np.abs(dx.astype(int)) + np.abs(dy)
+    strongest = strength >= np.quantile(strength, 0.995)
+    assert (made["image-edges"][3][strongest] > 0).mean() > 0.9
+    assert (made["random-lines"][3][strongest] > 0).mean() < 0.6
+
+
+def test_spread_keypoints_have_the_asked_number(sequence):
+    counts = [len(detect(frame, THESIS)) for frame in sequence.frames()]
+    target = np.mean(counts) / 2
+    distance = controls.min_distance(sequence, target)
+    assert distance > THESIS.min_distance and distance == round(distance, 1)
+    spread = replace(THESIS, min_distance=distance)
+    left = np.mean([len(detect(frame, spread)) for frame in sequence.frames()])
+    assert left == pytest.approx(target, rel=0.03)
+    assert controls.min_distance(sequence, max(counts)) == THESIS.min_distance
+
+
+def test_controls_leave_as_many_keypoints_as_masks_of_the_tested_width(
+    small_world, small_labels, tmp_path
+):
+    opened = [Sequence(small_world / "kitti", "00").subset(5)]
+    jobs = first_jobs(opened, {"thesis": (5, WIDTH), "refined": ()}, tested=5)
+    assert {job.dilation_width for job in jobs if job.method in methods.MASK_CONTROLS} == {5}
+    runs = runner.run_jobs(jobs, opened, small_labels, tmp_path).table
+    left = compare.keypoints_left(runs)
+    masked = compare.of_method(runs, "masked")
+    jobs += section_4_2.reduced_jobs(section_4_2.best_widths(masked))
+    jobs += runner.keypoint_controls(runs, opened, [Source(small_labels)], 1, 5)
+    assert len({job.name for job in jobs}) == len(jobs)
+    runs = runner.run_jobs(jobs, opened, small_labels, tmp_path).table.set_index("run")
+    assert list(runs.index) == [job.name for job in jobs] and compare.tested_width(runs) == 5
+    number = runs["mean_keypoints"]
+    assert left["00"] == number["masked-05-0"] < number["masked-10-0"]
+    fewer = number[number.index.str.startswith("fewer")]
+    spread = number[number.index.str.startswith("spread")]
+    assert fewer.iloc[0] == pytest.approx(left["00"], abs=1)
+    assert spread.iloc[0] == pytest.approx(left["00"], rel=0.05)
+
+
+# Ablations
+
+
+def test_every_ablation_differs_from_its_reference_in_one_thing(small_world, small_labels):
+    sequence = Sequence(small_world / "kitti", "00").subset(4)
+    runs = ablations.choices(sequence, small_labels)
+    settings, thesis_masks = runs["masked"]
+    assert settings == THESIS
+    expected = folders.LabelMasks(small_labels / "00", sequence, 10)
+    assert np.array_equal(thesis_masks[0], expected[0])
+    dropped, same = runs["filter"]
+    assert dropped.detector is keypoints.filtered and same is thesis_masks
+    for method in ("nearest", "symmetric"):
+        _, method_masks = runs[method]
+        assert not np.array_equal(method_masks[0], thesis_masks[0])
+        assert 0.5 < method_masks[0].sum() / thesis_masks[0].sum() < 2
+    label_map = cv2.imread(str(small_labels / "00" / sequence.frame_paths[0].name), 0)
+    enlarged = cv2.resize(label_map, sequence.size[::-1], interpolation=cv2.INTER_NEAREST)
+    _, method_masks = runs["no-vegetation"]
+    assert np.array_equal(method_masks[0] == 0, np.isin(enlarged, (21, 22)))
+
+
+def test_keypoints_are_divided_by_their_parallax(small_world):
+    sequence = Sequence(small_world / "kitti", "00").subset(3)
+    points, distances = ablations.parallax(sequence, 1)
+    spans = ((0, 3), (3, 20), (20, np.inf))
+    kept = [ablations.with_parallax(sequence, *span, 1) > 0 for span in spans]
+    assert [mask.sum() for mask in kept] == [
+        ((distances >= low) & (distances < high)).sum() for low, high in spans
+    ]
+    assert sum(mask.sum() for mask in kept) == len(points) > 100
+    drawn = ablations.as_many(sequence, *spans[0], 1)
+    assert np.count_nonzero(drawn) == kept[0].sum() and not np.array_equal(drawn > 0, kept[0])
+    assert not ablations.with_parallax(sequence, *spans[0], 2).any()  # no frame follows the last
+
+
+@pytest.mark.parametrize("degrees, kept_half", [(3, "right"), (-3, "left"), (0.5, "both")])
+def test_the_half_that_the_camera_turns_into_is_kept(degrees, kept_half):
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    poses[1, :3, :3] = Rotation.from_euler("y", degrees, degrees=True).as_matrix()
+    turning = SimpleNamespace(size=(4, 10), poses=poses)
+    mask, other = (ablations.half_in_turns(turning, into, 0) for into in (True, False))
+    halves = {"left": mask[:, :5].all(), "right": mask[:, 5:].all()}
+    assert {name for name, whole in halves.items() if whole} == (
+        {"left", "right"} if kept_half == "both" else {kept_half}
+    )
+    assert np.array_equal(other == 0, mask > 0) or kept_half == "both"
+    assert ablations.half_in_turns(turning, True, 1).all()  # the last frame
+
+
+def test_boundaries_between_close_ids_are_lost_and_between_distant_ids_found():
+    label_map = np.full((320, 320), 7, np.uint8)
+    label_map[:, 160:] = 8
+    near = ablations.boundaries(label_map, (188, 620))
+    label_map[:, 160:] = 23
+    far = ablations.boundaries(label_map, (188, 620))
+    plain = ablations.boundaries(np.full_like(label_map, 20), (188, 620))
+    assert near["lost"] == 100 == near["road/sidewalk"]
+    assert far["lost"] == 0 and np.isnan(far["road/sidewalk"])
+    assert far["invented"] > 0 == plain["invented"]

@@ -1,0 +1,86 @@
+"""Runs on a real Dask cluster on this machine: a scheduler and two workers, each a process."""
+
+import os
+import subprocess
+import sys
+import threading
+
+import pandas as pd
+import pytest
+from trials import ROOT, wait_for
+
+from keypoint_study import runner
+from keypoint_study.jobs import first_jobs
+from thesis_repro.data.kitti import Sequence
+from thesis_repro.errors import InputError
+from thesis_repro.running import workers
+
+pytestmark = pytest.mark.slow
+
+LOCAL = ("--host", "127.0.0.1", "--no-dashboard")
+
+
+def start(folder, *arguments):
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, "-m", "dask", *map(str, arguments), *LOCAL]
+    with open(folder / "dask.log", "a") as log:
+        return subprocess.Popen(command, cwd=folder, stdout=log, stderr=log, env=environment)
+
+
+@pytest.fixture(scope="module")
+def scheduler(tmp_path_factory):
+    """Address of a scheduler; it has no workers but those of `two_workers`."""
+    folder = tmp_path_factory.mktemp("scheduler")
+    file = folder / "scheduler.json"
+    places = ("--port", "0", "--dashboard-address", "127.0.0.1:0", "--scheduler-file", file)
+    process = start(folder, "scheduler", *places)
+    try:
+        wait_for(lambda: file.is_file() and file.read_text().strip().endswith("}"))
+        yield pd.read_json(file, typ="series")["address"]
+    finally:
+        process.kill()
+        process.wait()
+
+
+@pytest.fixture
+def two_workers(scheduler, tmp_path):
+    options = ("--no-nanny", "--nthreads", 1, "--local-directory", tmp_path / "scratch")
+    processes = [start(tmp_path, "worker", scheduler, *options) for _ in range(2)]
+    from dask.distributed import Client
+
+    try:
+        with Client(scheduler, set_as_default=False) as client:
+            client.wait_for_workers(2, timeout=120)
+        yield processes
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait()
+
+
+def test_an_unusable_scheduler_is_one_line(scheduler, monkeypatch):
+    monkeypatch.setattr(workers, "TIMEOUT", 1)
+    # without workers, none, no address
+    for address in (scheduler, "tcp://127.0.0.1:9", "nonsense://127.0.0.1:9"):
+        with pytest.raises(InputError, match=address) as error, workers.open_pool(1, address):
+            pass
+        assert "\n" not in str(error.value)
+
+
+def test_a_cluster_gives_the_same_bits_although_a_worker_is_killed(
+    small_world, small_labels, two_workers, scheduler, tmp_path
+):
+    opened = [Sequence(small_world / "kitti", name) for name in ("00", "01")]
+    jobs = first_jobs(opened, {"thesis": (5, 15)}, repetitions=2)
+    here = runner.run_jobs(jobs, opened, small_labels, tmp_path / "here")
+    there = tmp_path / "there"
+
+    def kill():
+        wait_for(lambda: list(there.rglob("[!.]*.csv")))
+        two_workers[0].kill()
+
+    killer = threading.Thread(target=kill)
+    killer.start()
+    result = runner.run_jobs(jobs, opened, small_labels, there, scheduler=scheduler)
+    killer.join()
+    pd.testing.assert_frame_equal(result.table, here.table, check_exact=True)

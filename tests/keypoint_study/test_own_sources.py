@@ -1,0 +1,184 @@
+"""Studies of what people bring: true poses of another kind, own keypoints."""
+
+import re
+
+import cv2
+import numpy as np
+import pandas as pd
+import pytest
+from street import Street
+
+from keypoint_study import sources, worth
+from keypoint_study.plan import Study
+from keypoint_study.report import study_report as report
+from keypoint_study.sources import Source
+from thesis_repro import odometry
+from thesis_repro.command.cli import main
+from thesis_repro.data.kitti import Sequence
+from thesis_repro.data.trajectories import write_kitti_poses
+from thesis_repro.errors import InputError
+from thesis_repro.odometry import metrics
+from thesis_repro.odometry.loop import VoteOfAll
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture
+def street(tmp_path, monkeypatch):
+    """A root with the street of noise as sequences 00 and 01, and one mask for all frames."""
+    monkeypatch.setattr(worth, "MAX_STEPS", 1)  # the worth takes longest, and is tested elsewhere
+    street, root = Street(12), tmp_path / "kitti"
+    projection = np.column_stack([street.intrinsics, np.zeros(3)]).ravel().tolist()
+    for name in ("00", "01"):
+        folder = root / "sequences" / name / "image_0"
+        folder.mkdir(parents=True)
+        for index, image in enumerate(street.images):
+            cv2.imwrite(str(folder / f"{index:06d}.png"), image)
+        (folder.parent / "calib.txt").write_text(f"P0: {' '.join(map(str, projection))}\n")
+        write_kitti_poses(root / f"poses/{name}.txt", street.poses)
+        mask = np.zeros(street.size, np.uint8)
+        mask[40:] = 255
+        (tmp_path / "masks" / name).mkdir(parents=True)
+        cv2.imwrite(str(tmp_path / "masks" / name / "mask.png"), mask)
+    return root
+
+
+def study(root, *options):
+    """Run a small study; returns its exit code and the folder of its results."""
+    out = root.parent / "out"
+    few = ["--estimator", "thesis", "--repetitions", 1, "--jobs", 1, "--output", out]
+    return main([*map(str, ["study", "--kitti", root, *few, *options])]), out
+
+
+def test_an_own_search_beside_an_estimator_with_its_own_is_refused(street, tmp_path):
+    file = tmp_path / "search.py"
+    file.write_text("def find_essential_matrix(current, previous, threshold): return None, None")
+
+    class Searching(VoteOfAll):
+        search = staticmethod(odometry.OPENCV.find_essential_matrix)
+
+    settings = odometry.OdometrySettings(estimator=Searching)
+    with pytest.raises(InputError, match="search.py"):
+        Source(file, "keypoints").run(Sequence(street, "00"), settings)
+
+
+def test_a_sequence_whose_true_poses_are_not_the_cameras_gets_no_verdict(street, capsys):
+    write_kitti_poses(street / "poses/00.txt", np.linalg.inv(Street(12).poses))
+    code, out = study(street, "--masks", street.parent / "masks")
+    assert code == 0 and "poses/00.txt: " in capsys.readouterr().err
+    assert set(pd.read_csv(out / "runs.csv", dtype=str)["sequence"]) == {"01"}
+    assert not (out / "paths-00.svg").exists() and (out / "paths-01.svg").is_file()
+    assert "are world-to-camera poses" in (out / "index.html").read_text()
+    code, _ = study(street, "--masks", street.parent / "masks", "--sequences", "00")
+    assert code == 1 and "poses/00.txt: " in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name, said", [("00", True), ("01", False)])
+def test_the_odometry_tells_true_poses_that_are_not_the_cameras(street, name, said, capsys):
+    write_kitti_poses(street / "poses/00.txt", Street(12).poses[::-1])
+    assert main(["odometry", "--kitti", str(street), "--sequence", name]) == 0
+    assert ("are in reverse order" in capsys.readouterr().err) == said
+
+
+@pytest.mark.real
+def test_real_poses_of_other_kinds_are_told(kitti_real):
+    sequence = Sequence(kitti_real, "05").subset(16)
+    estimated, true = odometry.run(sequence).poses, sequence.poses
+    axes = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])
+    body = np.linalg.inv(true[0]) @ true @ axes.T
+    for poses, kind in (
+        (np.linalg.inv(true), "inverse"),
+        (true[::-1], "reversed"),
+        (body, "turned"),
+        (axes @ body, "turned"),
+    ):
+        assert metrics.TRUTH_KINDS[kind] in metrics.foreign_truth(estimated, poses)
+    for poses in (true, body @ axes):  # as docs/own-masks.md says
+        assert metrics.foreign_truth(estimated, poses) == ""
+
+
+DETECT = """
+import cv2, numpy as np
+def detect(frame, settings, mask):
+    return {}
+"""
+CORNERS = "cv2.goodFeaturesToTrack(frame, 300, 0.01, 5)[:, 0]"
+TRACK = """
+def track(previous, current, points, settings):
+    return {}
+"""
+
+
+@pytest.mark.parametrize(
+    "text, said",
+    [
+        (
+            DETECT.format(f"{CORNERS}[:, ::-1]"),
+            "detect returned u .*, outside the frame of 480x160",
+        ),
+        (
+            DETECT.format(f"{CORNERS}.astype(int)"),
+            r"detect returned int64 \(\d+, 2\); must be float32",
+        ),
+        (DETECT.format(f"{CORNERS}[None]"), r"detect returned float32 \(1, \d+, 2\)"),
+        (DETECT.format("cv2.ORB.create().detect(frame)"), "detect returned tuple; must be"),
+        (DETECT.format("cv2.cvtColor(frame, 99999)"), "error: OpenCV"),
+        (TRACK.format("points, [1] * len(points)"), "track returned .* and list"),
+        (TRACK.format("points[1:], points[1:, 0] > 0"), "track returned float32"),
+        (TRACK.format("points"), "own.py: "),
+    ],
+)
+def test_own_functions_are_tried_before_the_study(street, text, said, capsys):
+    path = street.parent / "own.py"
+    path.write_text(text)
+    code, out = study(street, "--keypoints", path)
+    error = capsys.readouterr().err
+    assert code == 1 and not out.exists()
+    assert re.search(f"own.py: .*{said}|{said}", error) and "\\n" not in error
+    assert error.count("own.py") == 1
+
+
+def test_own_keypoints_are_drawn(street, capsys):
+    path = street.parent / "own.py"
+    path.write_text(DETECT.format(CORNERS))
+    masks = street.parent / "masks"
+    code, out = study(street, "--keypoints", f"own={path}", "--masks", masks, "--frames", 4)
+    assert code == 0
+    both = sources.named([("keypoints", "own", path), ("masks", None, masks)], None)
+    planned = Study(street, ("00", "01"), both, (), frames=4)
+    runs = pd.read_csv(out / "runs.csv", dtype={"sequence": str}, keep_default_na=False)
+    figure = report.figure_sources(planned, runs)
+    own, masked = np.reshape(figure.axes, (2, 3))
+    expected = cv2.goodFeaturesToTrack(Street(3).frame(2), 300, 0.01, 5)[:, 0]
+    assert np.array_equal(own[2].collections[0].get_offsets(), expected)
+    assert not own[1].images and masked[1].images
+    failed = runs[runs["source"] != "own"]
+    assert report._failed(planned, failed)["source"].tolist() == ["own"]
+    assert report._failed(planned, runs).empty
+
+
+BREAKING = """
+from thesis_repro.odometry.loop import detect as usual
+calls = []
+def detect(frame, settings, mask):
+    calls.append(frame)
+    if len(calls) > 5:
+        raise ValueError("broken:\\n" + 300 * "x ")
+    return usual(frame, settings, mask)
+"""
+
+
+def test_a_source_that_breaks_later_is_told_once_and_stays_in_the_summary(street, capsys):
+    path = street.parent / "own.py"
+    path.write_text(BREAKING)
+    masks = ["--masks", f"net={street.parent / 'masks'}", "--controls", "--frames", 6]
+    words = ["--keypoints", f"own={path}", "--sequences", "00", "--repetitions", 2]
+    code, out = study(street, *words, *masks)
+    lines = capsys.readouterr().err.splitlines()
+    (line,) = [line for line in lines if "broken" in line]
+    assert code == 1 and ",," not in line and "\\n" not in line
+    assert "failed: ValueError: broken: x x" in line
+    summary = pd.read_csv(out / "summary.csv").set_index("source")
+    assert summary.loc["own", "verdict"] == "all runs failed"
+    assert summary.loc["net", "verdict"] == "too few sequences to tell"
+    assert (out / "index.html").read_text().count("failed: ValueError") == 1

@@ -1,0 +1,334 @@
+"""Studies of a user's own masks: what they run, keep and refuse."""
+
+import re
+import shutil
+import signal
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pandas as pd
+import pytest
+import trials
+from evo.tools import file_interface
+
+from keypoint_study import runner
+from keypoint_study.plan import Study
+from keypoint_study.report import study_report as report
+from keypoint_study.sources import Source
+from thesis_repro.command.cli import main
+from thesis_repro.data import label_ids
+from thesis_repro.data.cityscapes import ID, TRAINED
+from thesis_repro.data.kitti import Sequence
+from thesis_repro.errors import InputError
+from thesis_repro.masks.folders import LabelMasks, write_masks
+from thesis_repro.running.files import write_png
+
+FRAMES = 4
+
+
+@pytest.fixture(scope="module")
+def masks(small_world, small_labels, tmp_path_factory):
+    """Ready-made masks of width 7, one folder a sequence."""
+    root = tmp_path_factory.mktemp("ready")
+    for name in ("00", "01"):
+        write_masks(
+            LabelMasks(small_labels / name, Sequence(small_world / "kitti", name), 7), root / name
+        )
+    return root
+
+
+@pytest.fixture(scope="module")
+def study(small_world, small_labels, masks):
+    planned = Study(
+        small_world / "kitti",
+        ("00", "01"),
+        (Source(small_labels, name="net"), Source(masks, "masks", "by-hand")),
+        (5, 7),
+        tested=7,
+        repetitions=2,
+        frames=FRAMES,
+    )
+    planned.check()
+    return planned
+
+
+@pytest.fixture(scope="module")
+def done(study, tmp_path_factory):
+    """(folder, runs) of the study."""
+    folder = tmp_path_factory.mktemp("study") / "out"
+    runs = study.run(folder).table
+    report.write_paths(study, runs, folder)
+    return folder, runs
+
+
+def files(folder):
+    return {path: path.stat().st_mtime_ns for path in (folder / "runs").rglob("[!.]*.csv")}
+
+
+def test_ready_made_masks_give_the_errors_of_label_maps_of_that_width(done):
+    _, runs = done
+    masked = runs[(runs["method"] == "masked") & (runs["dilation_width"] != 5)]
+    net, by_hand = (
+        masked.loc[masked["source"] == name, "rmse"].tolist() for name in ("net", "by-hand")
+    )
+    assert len(net) == 4 and net == by_hand
+    # the baseline is shared
+    assert (runs["method"] == "baseline").sum() == 4 and set(
+        runs.loc[runs["method"] == "baseline", "source"]
+    ) == {""}
+
+
+def test_evo_reads_the_written_paths(done, study):
+    folder, runs = done
+    poses = runner.run_poses(runs[runs["repetition"] == 0], folder / "runs")
+    files = {
+        form: {
+            str(path.relative_to(folder / "paths" / form).with_suffix("")): path
+            for path in (folder / "paths" / form).rglob("*.txt")
+        }
+        for form in ("kitti", "tum")
+    }
+    names = {f"{name}/{run}" for name, run in poses} | {"00/truth", "01/truth"}
+    assert files["kitti"].keys() == files["tum"].keys() == names
+    times = Sequence(study.kitti, "00").times[:FRAMES]
+    for (name, run), expected in poses.items():
+        assert np.array_equal(
+            file_interface.read_kitti_poses_file(files["kitti"][f"{name}/{run}"]).poses_se3,
+            expected,
+        )
+        tum = file_interface.read_tum_trajectory_file(files["tum"][f"{name}/{run}"])
+        assert np.array_equal(tum.timestamps, times) and np.allclose(
+            tum.poses_se3, expected, atol=1e-9
+        )
+
+
+def test_figures_and_tables_of_a_study(done, study):
+    folder, runs = done
+    page = report.write(study, runs, folder)
+    for name in ("comparison", "sources", "paths-00", "paths-01"):
+        assert (folder / f"{name}.pdf").read_bytes().startswith(b"%PDF")
+        assert {f"{name}.svg", f"{name}.webp"} & {path.name for path in folder.iterdir()}
+    for name in ("summary", "comparison", "widths", "errors"):
+        assert (folder / f"{name}.md").is_file()
+    assert not (folder / "runs.tex").exists()
+    links = re.findall('(?:href|src)="([^"#]+)"', page.read_text())
+    assert {"sources.webp", "paths-01.pdf", "errors.tex"} <= set(links)
+    assert all((folder / link).is_file() for link in links)
+    assert len(report.figure_sources(study, runs).axes) == 3 * len(study.sources)
+    failed = (runs["sequence"] == "01") & (runs["source"] == "net")
+    figure = report.figure_paths(study, runs[~failed], study.opened[1], folder)
+    assert len(figure.axes[0].lines) == 3  # all keypoints, by hand, ground truth
+
+
+def test_a_repeated_study_runs_nothing_and_another_source_only_its_runs(
+    done, study, small_labels, tmp_path, monkeypatch
+):
+    folder, runs = tmp_path / "out", done[1]
+    shutil.copytree(done[0], folder)
+    times = files(folder)
+    with monkeypatch.context() as patch:
+        patch.setattr(runner.odometry, "run_many", None)  # would fail
+        again = study.run(folder)
+    assert again.table.equals(runs)
+    assert (again.made, again.kept, again.failed_jobs) == (0, len(runs), 0)
+    other = tmp_path / "other"
+    shutil.copytree(small_labels, other)
+    for path in other.rglob("*.png"):
+        cv2.imwrite(str(path), cv2.flip(cv2.imread(str(path), 0), 1))
+    # another network of this name
+    replace(study, sources=(Source(other, name="net"), study.sources[1])).run(folder)
+    changed = {
+        path for path in times if not path.is_file() or path.stat().st_mtime_ns != times[path]
+    }
+    assert changed and {path.parent.name for path in changed} == {"net"}
+
+
+def test_a_killed_study_resumes_and_ends_as_an_undisturbed_one(
+    done, study, small_world, small_labels, masks, tmp_path
+):
+    folder = tmp_path / "out"
+    sources = ["--labels", f"net={small_labels}", "--masks", f"by-hand={masks}"]
+    sizes = ["--widths", 5, 7, "--controls", 7, "--repetitions", 2, "--frames", FRAMES]
+    words = ["study", "--kitti", small_world / "kitti", *sources, *sizes, "--estimator", "thesis"]
+    process = trials.start(trials.thesis(*words, "--jobs", 1, "--output", folder), trials.ROOT)
+    trials.wait_for(lambda: process.poll() is not None or files(folder), 600)
+    trials.kill(process)
+    assert process.returncode == -signal.SIGKILL
+    finished = files(folder)
+    assert study.run(folder).table.equals(done[1])
+    assert finished == {path: path.stat().st_mtime_ns for path in finished}
+
+
+def test_each_folder_of_label_maps_may_name_its_ids(small_world, small_labels, tmp_path):
+    numbers = np.full(256, 255, np.uint8)  # train ids, by label id
+    numbers[[ID[name] for name in TRAINED]] = range(len(TRAINED))
+    for path in sorted((small_labels / "00").iterdir()):
+        train_ids = numbers[cv2.imread(str(path), cv2.IMREAD_UNCHANGED)]
+        write_png(tmp_path / "train" / "00" / path.name, train_ids)
+        label_map = label_ids.read(tmp_path / "train" / "00" / path.name, "train")
+        write_png(tmp_path / "7:00" / "00" / path.name, label_map)
+    where = ["--kitti", small_world / "kitti", "--sequences", "00", "--frames", 4]
+    sources = ["--labels", f"mine={tmp_path / 'train'}:train", "--labels", tmp_path / "7:00"]
+    counts = ["--widths", 5, "--repetitions", 1, "--estimator", "thesis", "--jobs", 1]
+    words = [*where, *sources, *counts, "--output", tmp_path / "out"]
+    assert main(["study", *map(str, words)]) == 0
+    runs = pd.read_csv(tmp_path / "out" / "runs.csv", keep_default_na=False).set_index("source")
+    assert list(runs.index) == ["", "mine", "7-00"]
+    assert runs.loc["mine", "rmse"] == runs.loc["7-00", "rmse"] != runs.loc["", "rmse"]
+
+
+@pytest.fixture
+def brought(study, done, tmp_path):
+    """A study of own keypoints, which are all keypoints, and of the paths with all keypoints."""
+    (tmp_path / "mine.py").write_text("from thesis_repro.odometry.loop import detect\n")
+    (tmp_path / "slam").mkdir()
+    for name, form in (("00", "kitti"), ("01", "tum")):
+        written = done[0] / "paths" / form / name / "baseline-0.txt"
+        shutil.copy(written, tmp_path / "slam" / f"{name}.txt")
+    sources = (
+        Source(tmp_path / "mine.py", "keypoints", "mine"),
+        Source(tmp_path / "slam", "paths", "slam"),
+    )
+    return replace(study, sources=sources, widths=(), tested=None)
+
+
+def test_own_keypoints_and_paths_are_rows_as_masks_are(brought, tmp_path):
+    brought.check()
+    runs = brought.run(tmp_path / "out").table
+    keys = ["sequence", "repetition"]
+    of_all, mine, slam = (
+        runs[runs["source"] == name].set_index(keys) for name in ("", "mine", "slam")
+    )
+    numbers = ["rmse", "se3", "rotation", "mean_keypoints"]
+    assert mine[numbers].equals(of_all[numbers]) and len(mine) == 4
+    expected = of_all.loc[slam.index, numbers[:3]]
+    assert np.allclose(slam[numbers[:3]], expected, atol=1e-8) and len(slam) == 2
+    report.write(brought, runs, tmp_path / "out")
+    summary = pd.read_csv(tmp_path / "out" / "summary.csv")
+    assert list(summary["source"]) == ["mine", "slam"] and summary["keypoints"].count() == 1
+    errors = pd.read_csv(tmp_path / "out" / "errors.csv")
+    assert list(errors["method"]) == ["all keypoints", "mine", "slam"] * 2
+    times = files(tmp_path / "out")
+    path = tmp_path / "slam" / "00.txt"
+    path.write_text(path.read_text() + "1 0 0 0 0 1 0 0 0 0 1 9\n" * 8)  # twelve, as frames are
+    again = brought.run(tmp_path / "out")
+    changed = {path for path, time in times.items() if path.stat().st_mtime_ns != time}
+    assert (again.made, again.kept) == (1, len(runs) - 1) and len(changed) == 1
+    assert again.table["se3"].equals(runs["se3"])
+
+
+@pytest.mark.parametrize(
+    "name, text, named",
+    [
+        ("mine.py", "detector = 5", "mine.py: must define"),
+        ("slam/00.txt", "1 0 0 0 0 1 0 0 0 0 1 0\n" * 3, "00.txt: 3 poses for 4 frames"),
+        ("slam/00.txt", "1 0 0 0 0 1 0 0 0 0 1\n" * 4, "00.txt, line 1: "),
+    ],
+)
+def test_what_is_no_path_and_no_keypoints_is_named(brought, tmp_path, name, text, named):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(InputError, match=named):
+        brought.check()
+    (tmp_path / name).unlink()
+    with pytest.raises((InputError, OSError), match=name):
+        brought.check()
+
+
+def test_results_of_another_length_are_kept(done, study):
+    before = files(done[0])
+    with pytest.raises(InputError, match="other settings"):
+        replace(study, frames=5).run(done[0])
+    assert files(done[0]) == before
+
+
+@pytest.mark.parametrize(
+    "options, named",
+    [
+        ("", "--labels"),
+        ("--labels nowhere", "nowhere: "),
+        ("--labels nowhere:train", "nowhere: "),
+        ("--paths nowhere", "nowhere/00.txt: "),
+        ("--keypoints none.py", "none.py"),
+        ("--paths a=nowhere --labels a={labels}", "'a'"),
+        ("--labels {labels}:none.csv", "none.csv: "),
+        ("--labels {labels} --labels {labels}", "small_labels"),
+        ("--labels a={labels} --masks A={masks}", "'A'"),
+        ("--labels a*b={labels}", "--labels a*b="),
+        ("--labels ={labels}", "--labels ="),
+        ("--labels a/b={labels}", "a/b="),
+        ("--masks {masks} --widths 5", "--widths: "),
+        ("--masks {masks} --symmetric", "--labels"),
+        ("--masks {labels}", "320x320"),
+        ("--labels {labels}/00", "2 are asked for"),
+        ("--labels {less} --sequences 00", "2 of 12 frames of sequence 00"),
+        ("--labels {labels} --controls -1", "dilation width -1: "),
+    ],
+)
+def test_bad_input_is_one_line_before_anything_runs(
+    small_world, small_labels, masks, tmp_path, capsys, options, named
+):
+    less = tmp_path / "less"
+    shutil.copytree(small_labels / "00", less / "00")
+    for index in (3, 4):
+        (less / "00" / f"{index:06d}.png").unlink()
+    words = options.format(labels=small_labels, masks=masks, less=less).split()
+    assert (
+        main(
+            [
+                "study",
+                "--kitti",
+                str(small_world / "kitti"),
+                *words,
+                "--output",
+                str(tmp_path / "out"),
+            ]
+        )
+        == 1
+    )
+    error = capsys.readouterr().err.strip()
+    assert (
+        error.startswith("error: ")
+        and named in error
+        and "\n" not in error
+        and not (tmp_path / "out").exists()
+    )
+
+
+def test_a_study_without_any_masked_run_is_one_clear_line(small_world, small_labels, tmp_path):
+    shutil.copytree(small_labels / "00", tmp_path / "labels" / "00")
+    damaged = tmp_path / "labels" / "00" / "000002.png"
+    damaged.write_bytes(damaged.read_bytes()[:-20])
+    study = Study(
+        small_world / "kitti", ("00",), (Source(tmp_path / "labels", name="net"),), (5,), frames=5
+    )
+    with pytest.raises(InputError, match="every run but those with all keypoints failed"):
+        study.run(tmp_path / "out")
+
+
+def test_a_sequence_named_like_a_column_of_the_tables_is_refused(tiny_kitti):
+    for place in ("sequences/{}", "poses/{}.txt"):
+        (tiny_kitti / place.format("00")).rename(tiny_kitti / place.format("ratio"))
+    study = Study(tiny_kitti, ("ratio",), (), (5,))
+    with pytest.raises(InputError, match="ratio: has the name of a column"):
+        study.check()
+
+
+def test_a_study_without_ground_truth_says_what_keypoints_are_worth(
+    small_world, masks, tmp_path, capsys
+):
+    folder = tmp_path / "kitti" / "sequences" / "00"
+    folder.parent.mkdir(parents=True)
+    folder.symlink_to(small_world / "kitti" / "sequences" / "00")
+    where = ["--kitti", tmp_path / "kitti", "--frames", 4, "--output", tmp_path / "out"]
+    words = ["study", *where, "--masks", f"mine={masks}", "--jobs", 1]
+    assert main(list(map(str, words))) == 0
+    table = pd.read_csv(tmp_path / "out" / "worth_runs.csv", dtype={"sequence": str})
+    assert {"random keypoints", "spread keypoints", "mine: masks"} < set(table["choice"])
+    assert (table["steps"] == 3).all() and (table[["rotation", "direction"]] > 0).all(axis=None)
+    shown = pd.read_csv(tmp_path / "out" / "worth.csv")
+    assert list(shown["choice"]) == list(table["choice"].unique())
+    assert (tmp_path / "out" / "worth.svg").is_file()
+    again = (tmp_path / "out" / "worth" / "00" / "400.csv").stat().st_mtime_ns
+    assert main(list(map(str, words))) == 0  # reads what is there
+    assert (tmp_path / "out" / "worth" / "00" / "400.csv").stat().st_mtime_ns == again

@@ -1,0 +1,193 @@
+"""What a keypoint is worth: simulated scenes with a known truth, and the rule's verdicts."""
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+from street import Street
+
+from keypoint_study import compare, worth
+from thesis_repro.errors import InputError
+from thesis_repro.odometry import OPENCV, THESIS
+
+FOCAL, CENTRE, SIZE = 718.856, np.array([607.2, 185.2]), np.array([1241, 376])
+NOISE = 0.05  # pixels, far below the threshold of an inlier, so that variances are proportional
+FORWARD = np.array([0.0, 0.0, 1.0])  # the simulated motion; there is no rotation
+
+
+def tracks(points, depths, noise):
+    """Keypoints (N, 2) of a camera that moves forward by 1 m; noise: (N, 2), pixels."""
+    rays = (points - CENTRE) / FOCAL
+    moved = np.column_stack([rays, np.ones(len(rays))]) * depths[:, None] - FORWARD
+    current = moved[:, :2] / moved[:, 2:] + noise / FOCAL
+    return worth.Tracks(points, rays, current, np.ones(len(points), bool), THESIS.threshold)
+
+
+def uniform(random, count):
+    points = random.uniform((0, 60), SIZE, (count, 2))
+    return points, np.exp(random.uniform(np.log(6), np.log(60), count))
+
+
+def independent(random, noise=NOISE, count=200):
+    points, depths = uniform(random, count)
+    return tracks(points, depths, random.normal(0, noise, points.shape))
+
+
+def copied(random, same=1.0):
+    """100 keypoints and 100 neighbours within 6 pixels, whose noise is correlated by `same`."""
+    points, depths = uniform(random, 100)
+    noise, other = random.normal(0, NOISE, (2, 100, 2))
+    noises = [noise, same * noise + np.sqrt(1 - same**2) * other]
+    beside = points + random.uniform(-6, 6, points.shape) * (same < 1)
+    both = np.concatenate([points, beside])
+    return tracks(both, np.tile(depths, 2), np.concatenate(noises))
+
+
+def crowded(random):
+    """200 keypoints with independent noise in 20 crowds."""
+    places, _ = uniform(random, 20)
+    points = np.repeat(places, 10, axis=0) + random.normal(0, 12, (200, 2))
+    _, depths = uniform(random, 200)
+    return tracks(points, depths, random.normal(0, NOISE, points.shape))
+
+
+def variances(make, scenes):
+    """Variance of one keypoint (rotation, direction): by each split, and true, from the errors."""
+    rows = []
+    truth = type("Truth", (), {"rotation": np.eye(3), "translation": FORWARD})
+    for scene in range(scenes):
+        simulated = make(np.random.default_rng(scene))
+        count = len(simulated.points)
+        error = worth._angles(worth.refined_motion(simulated, np.arange(count)), truth)
+        row = dict(zip(("rotation_true", "direction_true"), np.square(error) * count, strict=True))
+        for split in worth.SPLIT:
+            halves = worth._halves(simulated, count, split, (0, scene))
+            row |= {f"{name}_{split}": halves[f"{name}_variance"] for name in worth.MOTIONS}
+        rows.append(row)
+    return pd.DataFrame(rows).median()
+
+
+SCENES = {
+    "independent": independent,
+    "each twice": copied,
+    "neighbours, correlation 0.8": lambda random: copied(random, 0.8),
+    "20 crowds": crowded,
+    "twice the noise": lambda random: independent(random, 2 * NOISE),
+}
+
+
+def worths_of(names, scenes):
+    """The worths of simulated scenes, those of "independent" being 1; one column a kind."""
+    table = pd.DataFrame({name: variances(SCENES[name], scenes) for name in names})
+    return table.rdiv(table["independent"], axis=0)
+
+
+@pytest.mark.slow
+def test_copies_tell_nothing_which_only_fields_see_and_twice_the_noise_a_quarter():
+    table = worths_of(["independent", "each twice", "twice the noise"], 250)
+    assert table["twice the noise"].between(0.19, 0.32).all(), table
+    twice = table["each twice"]
+    for motion in worth.MOTIONS:
+        assert twice[[f"{motion}_true", f"{motion}_fields"]].between(0.35, 0.65).all(), twice
+        assert twice[f"{motion}_points"] > 0.8, twice
+
+
+@pytest.mark.torture
+def test_simulated_scenes(capsys):
+    """The table in docs/reading-results.md."""
+    table = worths_of(SCENES, 300)
+    with capsys.disabled():
+        print("\n" + table.T.round(2).to_string())
+    assert (table.loc[["rotation_points", "direction_points"], "each twice"] > 0.8).all()
+
+
+def worths(logarithms):
+    """A table of `worth` with given logarithms of the worths, (streets, 4)."""
+    rows = []
+    for street, values in enumerate(np.exp(logarithms)):
+        for split, numbers in zip(worth.SPLIT, values.reshape(2, 2), strict=True):
+            row = {"sequence": str(street), "choice": "mine", "number": 400, "split": split}
+            rows.append({**row, "keypoints": 400, **dict(zip(worth.MOTIONS, numbers, strict=True))})
+    return pd.DataFrame(rows)
+
+
+def test_verdicts_need_both_splits_and_both_motions():
+    random = np.random.default_rng(0)
+    near_one = random.normal(0, 0.03, (8, 4))
+
+    def verdict(logarithms):
+        (row,) = worth.typical(worths(logarithms)).itertuples()
+        return row.verdict
+
+    assert verdict(near_one) == worth.ALIKE
+    assert verdict(near_one - 0.7) == worth.LESS
+    assert verdict(near_one + 0.7) == worth.MORE
+    for column in range(4):
+        less_but_one = near_one - 0.7 * (np.arange(4) != column)
+        assert verdict(less_but_one) == compare.NO_CLEAR_DIFFERENCE
+    assert verdict(near_one[:5] - 0.7) == compare.TOO_FEW
+
+
+def test_error_rates_of_the_verdicts_by_chance():
+    """Eight streets that differ by 30 %; worths of one street are correlated by 0.5."""
+    random = np.random.default_rng(0)
+
+    def verdicts(centre):
+        spread = random.normal(0, 0.3 * np.sqrt(0.5), (200, 8, 1))
+        spread = spread + random.normal(0, 0.3 * np.sqrt(0.5), (200, 8, 4))
+        return [worth._verdict(list((each + centre).T)) for each in spread]
+
+    wrong = [each in (worth.LESS, worth.MORE) for each in verdicts(0)]
+    assert np.mean(wrong) < 0.03
+    assert np.mean([each == worth.LESS for each in verdicts(np.log(0.5))]) > 0.9
+    assert np.mean([each == worth.ALIKE for each in verdicts(np.log(worth.AS_MUCH))]) < 0.05
+
+
+def test_the_table_is_the_same_every_time_and_an_empty_mask_tells_nothing(monkeypatch):
+    street = Street(5)
+    choices = {
+        ("random", 100): (THESIS, None),
+        ("few", 0): (replace(THESIS, max_keypoints=60), None),
+        ("none", 100): (THESIS, [np.zeros(street.size, np.uint8)] * len(street)),
+    }
+    table = worth.worth(street, choices)
+    pd.testing.assert_frame_equal(table, worth.worth(street, choices))
+    monkeypatch.setattr(worth, "SEED", 1)
+    assert not table.equals(worth.worth(street, choices))
+    table = table.set_index(["choice", "split"])
+    assert (table["steps"] == 4).all()
+    assert (table.loc["random", "keypoints"] == 100).all()
+    assert (table.loc["few", "keypoints"] == 60).all()
+    assert (table.loc["none", ["rotation_deg", "direction_deg"]] == worth.NO_MOTION).all(axis=None)
+    assert (table.loc["none", ["rotation", "direction"]] < 0.1).all(axis=None)
+
+
+def test_own_keypoints_are_found_and_tracked_by_their_own_functions():
+    street = Street(3)
+    calls = {"still": OPENCV._replace(track=lambda _, __, points, ___: (points, points[:, 0] > 0))}
+    choices = {("still", 100): (THESIS, None), ("tracked", 100): (THESIS, None)}
+    table = worth.worth(street, choices, calls=calls).set_index(["choice", "split"])
+    assert (table.loc["still", "rotation_deg"] != table.loc["tracked", "rotation_deg"]).all()
+
+
+def test_what_the_camera_did_not_see_has_no_keypoints(monkeypatch):
+    street = Street(3)
+    visible = np.zeros_like(street.frame(0))
+    visible[:, : visible.shape[1] // 2] = 255
+    choices = {("all", 0): (THESIS, None)}
+    whole = worth.worth(street, choices)
+    monkeypatch.setattr(street, "visible", lambda index: visible)
+    half = worth.worth(street, choices)
+    assert 0 < half["keypoints"].max() < 0.8 * whole["keypoints"].min()
+
+
+def test_steps_without_lengths_are_all_kept_and_short_ones_are_not():
+    street = Street(4)
+    street.poses[2:, :3, 3] = street.poses[1, :3, 3]  # the last two steps are short
+    assert (worth.worth(street, {("all", 0): (THESIS, None)})["steps"] == 1).all()
+    street.has_truth, street.speed = False, None
+    assert (worth.worth(street, {("all", 0): (THESIS, None)})["steps"] == 3).all()
+    street.folder, street.speed, street.times = "street", 0.0, np.arange(4)
+    with pytest.raises(InputError):
+        worth.worth(street, {("all", 0): (THESIS, None)})

@@ -1,0 +1,30 @@
+"""Values that people write as texts, for options and settings.
+
+Each function raises ValueError for a text of another kind, and its name says in messages which kind
+is wanted.
+"""
+
+
+def positive_whole_number(text: str) -> int:
+    """Return the whole number from 1 on in a text."""
+    if int(text) < 1:
+        raise ValueError
+    return int(text)
+
+
+def number_of_frames(text: str) -> int | None:
+    """Return the number of frames in a text, or None for "all"."""
+    if text == "all":
+        return None
+    return positive_whole_number(text)
+
+
+def list_of_widths(text: str) -> tuple[int, ...]:
+    """Return the dilation widths, pixels, in a text such as "1-3,10", sorted."""
+    chosen: set[int] = set()
+    for word in text.split(","):
+        first, _, last = word.partition("-")
+        chosen.update(range(positive_whole_number(first), positive_whole_number(last or first) + 1))
+    if not chosen:  # such as 5-1
+        raise ValueError
+    return tuple(sorted(chosen))
