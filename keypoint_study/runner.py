@@ -273,7 +273,7 @@ def _stage(folder: Path, sequence: Sequence, made_from: Mapping[str, Mapping[str
     provenance.stage(
         folder / sequence.name,
         **_versions(),
-        sequence=provenance.digest_of_files(sequence.files),
+        sequence=sequence.digest(),
         **made_from.get(sequence.name, {}),
     )
     for place, inputs in made_from.items():

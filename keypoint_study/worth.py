@@ -75,7 +75,6 @@ from thesis_repro.odometry import (
     Motion,
     OdometrySettings,
     metrics,
-    scales,
 )
 from thesis_repro.odometry.keypoints import filled, spread
 from thesis_repro.odometry.loop import MIN_MATCHES, normalise
@@ -131,7 +130,7 @@ def worth(
     """
     for _, masks in choices.values():
         check(sequence, masks)
-    steps = np.flatnonzero(scales(sequence)[1:] >= metrics.MIN_DIRECTED_STEP)
+    steps = np.flatnonzero(sequence.scales[1:] >= metrics.MIN_DIRECTED_STEP)
     if not len(steps):
         raise InputError(
             f"{sequence.folder}: no step of {metrics.MIN_DIRECTED_STEP} m or more, and shorter ones "

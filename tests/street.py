@@ -6,6 +6,8 @@ It is rendered with exact arithmetic, the same on every machine.
 import cv2
 import numpy as np
 
+from thesis_repro.data.memory import distances
+
 
 class Street:
     """A sequence, as far as `odometry.run` needs one.
@@ -50,6 +52,10 @@ class Street:
                 cv2.INTER_LINEAR,
             )
             self.images.append((128 + (image - 128.0) / (1 + depth / 20)).astype(np.uint8))
+
+    @property
+    def scales(self):
+        return distances(self.poses)
 
     def __len__(self):
         return len(self.images)

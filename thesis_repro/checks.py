@@ -146,7 +146,7 @@ def sequence_warnings(sequence: kitti.Sequence) -> list[str]:
 def _step_warnings(sequence: kitti.Sequence) -> list[str]:
     """Warn of steps longer or faster than what drives, and of gaps in the times."""
     intervals = np.diff(sequence.times)
-    lengths, unit = kitti.scales(sequence)[1:], "times in seconds, and the speed in metres a second"
+    lengths, unit = sequence.scales[1:], "times in seconds, and the speed in metres a second"
     if sequence.has_truth:
         unit = "true positions in metres, and times in seconds"
     impossible = lengths > MAX_STEP

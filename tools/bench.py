@@ -71,12 +71,12 @@ def step_cost(sequence):
     followers = [
         Odometry(sequence.intrinsics, replace(THESIS, estimator=make)) for make in (None, refined)
     ]
-    metres, costs = odometry.scales(sequence), []
+    metres, costs = sequence.scales, []
     clock = time.thread_time  # does not count other processes
     previous = sequence.frame(0)
     for follower in followers:
         follower.step(previous)
-    for index, frame in enumerate(list(sequence.frames())[1:], 1):
+    for index, frame in enumerate(list(sequence)[1:], 1):
         calls = bare_calls(previous, frame, followers[0].points, sequence.intrinsics)
         before, least = followers, np.full(3, np.inf)
         for _ in range(REPEATS):  # in turn, so that all three share the machine's load
@@ -97,9 +97,7 @@ def shared_cost(sequence):
     The last value is whether their poses are equal.
     """
     # edges of the frames stand in for label maps
-    contours = [
-        cv2.Canny(cv2.GaussianBlur(frame, (0, 0), 4), 20, 60) for frame in sequence.frames()
-    ]
+    contours = [cv2.Canny(cv2.GaussianBlur(frame, (0, 0), 4), 20, 60) for frame in sequence]
     runs = {"": (THESIS, None)} | {
         f"{width}": (THESIS, [masks.dilate(edges, width) for edges in contours]) for width in WIDTHS
     }

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from keypoint_study.report import style
-from thesis_repro.odometry import THESIS, Matches, Odometry, metrics, scales
+from thesis_repro.odometry import THESIS, Matches, Odometry, metrics
 from thesis_repro.odometry.estimators import refined
 from thesis_repro.odometry.refined.fit import SUPPORT_THRESHOLDS, near, with_uncertainty
 
@@ -41,7 +41,7 @@ def measure(sequence, masks):
     flags.
     """
     rows = []
-    scale = scales(sequence)
+    scale = sequence.scales
     cell = [sequence.size[1] / CELLS, sequence.size[0] / CELLS]
     for index, steps in _steps(sequence, masks, range(len(sequence))):
         reference = steps["all"].motion
@@ -78,7 +78,7 @@ def measure(sequence, masks):
 def _steps(sequence, masks, indices):
     """Yield (frame index, {kind: step}) for consecutive frames of a sequence."""
     odometries = {kind: Odometry(sequence.intrinsics, SETTINGS) for kind in KINDS}
-    scale = scales(sequence)
+    scale = sequence.scales
     for index in indices:
         frame = sequence.frame(index)
         frame_masks = {"all": None, "masks": masks[index]}

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from keypoint_study import compare, worth
 from keypoint_study.report import style, texts
-from thesis_repro.odometry import Matches, scales
+from thesis_repro.odometry import Matches
 from thesis_repro.odometry.metrics import MIN_DIRECTED_STEP
 from thesis_repro.odometry.refined.fit import near
 from thesis_repro.odometry.sharing import SharedCalls
@@ -40,7 +40,7 @@ def measure(sequences, sources, width) -> pd.DataFrame:
     for sequence in sequences:
         choices, _ = worth.choices(sequence, sources, width, worth.DECIDING)
         shared = SharedCalls()
-        lengths = scales(sequence)
+        lengths = sequence.scales
         for index in progress(range(0, len(sequence) - 1, EVERY), f"why, {sequence.name}"):
             if lengths[index + 1] < MIN_DIRECTED_STEP:
                 continue

@@ -16,7 +16,7 @@ import pandas as pd
 
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.masks.folders import MaskFolder
-from thesis_repro.odometry import THESIS, Odometry, run_many, scales
+from thesis_repro.odometry import THESIS, Odometry, run_many
 from thesis_repro.odometry.estimators import refined
 from thesis_repro.odometry.loop import normalise
 
@@ -87,7 +87,7 @@ def steps(sequence, masks, first, last, count=2000):
         frames = sequence.frame(index - 1), sequence.frame(index)
         points = matched_points(*frames, masks[index - 1], count)
         row = estimated(*points, sequence.intrinsics)
-        step = follower.step(frames[1], scales(sequence)[index], masks[index])
+        step = follower.step(frames[1], sequence.scales[index], masks[index])
         np.testing.assert_array_equal(step.current, row["current"])
         motion = {
             "frames": index,

@@ -349,7 +349,7 @@ def test_frames_of_16_bits_are_scaled_by_their_maximum(own, caplog):
         cv2.imwrite(str(path), frame.astype(np.uint16) * 16)
     sequence = kitti.Sequence(None, own)
     white = int(expected[0].max())
-    for index, frame in enumerate(sequence.frames()):
+    for index, frame in enumerate(sequence):
         exact = np.minimum(expected[index].astype(float) * 255 / white, 255)
         assert frame.dtype == np.uint8 and np.abs(frame - exact).max() <= 0.5
     assert sum("16 bits" in line for line in caplog.messages) == 1

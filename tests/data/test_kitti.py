@@ -20,7 +20,7 @@ def test_reads_a_sequence(tiny_kitti):
     (tiny_kitti / "sequences/00/image_0/.000002.4711.png").write_bytes(b"half")
     assert kitti.sequences(tiny_kitti) == ["00"]
     sequence = kitti.Sequence(tiny_kitti, "00")
-    assert len(sequence) == 4 and sequence.size == (48, 64) and len(list(sequence.frames())) == 4
+    assert len(sequence) == 4 and sequence.size == (48, 64) and len(list(sequence)) == 4
     assert np.array_equal(sequence.intrinsics, [[50, 0, 32], [0, 50, 24], [0, 0, 1]])
     assert np.array_equal(sequence.poses[:, 2, 3], [0, 1, 2, 3]) and sequence.times[-1] == 0.3
     assert np.array_equal(sequence.frame(1)[:, :63], sequence.frame(0)[:, 1:])
@@ -53,10 +53,10 @@ def test_without_ground_truth_steps_are_assumed(tiny_kitti):
     (tiny_kitti / "poses/00.txt").rename(tiny_kitti / "poses/away.txt")
     (tiny_kitti / "sequences/00/times.txt").write_text("0\n0.1\n0.3\n0.4\n")
     sequence = kitti.Sequence(tiny_kitti, "00")
-    assert not sequence.has_truth and np.array_equal(odometry.scales(sequence), [0, 1, 1, 1])
+    assert not sequence.has_truth and np.array_equal(sequence.scales, [0, 1, 1, 1])
     assert np.array_equal(odometry.start_pose(sequence), np.eye(4))
     np.testing.assert_allclose(
-        odometry.scales(kitti.Sequence(tiny_kitti, "00", speed=5).subset(3)), [0, 0.5, 1]
+        kitti.Sequence(tiny_kitti, "00", speed=5).subset(3).scales, [0, 0.5, 1]
     )
     with pytest.raises(InputError, match="poses/00.txt"):
         sequence.poses  # noqa: B018
@@ -73,7 +73,7 @@ def test_frames_a_second_replace_a_missing_file_of_times(tiny_kitti):
     (tiny_kitti / "poses/00.txt").unlink()
     sequence = kitti.Sequence(tiny_kitti, "00", speed=5, fps=25)
     np.testing.assert_allclose(sequence.times, [0, 0.04, 0.08, 0.12])
-    np.testing.assert_allclose(odometry.scales(sequence), [0, 0.2, 0.2, 0.2])
+    np.testing.assert_allclose(sequence.scales, [0, 0.2, 0.2, 0.2])
     for fps in (0, -1, np.nan, np.inf):
         with pytest.raises(InputError, match="fps"):
             kitti.Sequence(tiny_kitti, "00", fps=fps)

@@ -87,12 +87,12 @@ def test_random_lines_and_image_edges_cover_as_much_as_the_mask(sequence, made):
 
 
 def test_spread_keypoints_have_the_asked_number(sequence):
-    counts = [len(detect(frame, THESIS)) for frame in sequence.frames()]
+    counts = [len(detect(frame, THESIS)) for frame in sequence]
     target = np.mean(counts) / 2
     distance = controls.min_distance(sequence, target)
     assert distance > THESIS.min_distance and distance == round(distance, 1)
     spread = replace(THESIS, min_distance=distance)
-    left = np.mean([len(detect(frame, spread)) for frame in sequence.frames()])
+    left = np.mean([len(detect(frame, spread)) for frame in sequence])
     assert left == pytest.approx(target, rel=0.03)
     assert controls.min_distance(sequence, max(counts)) == THESIS.min_distance
 

@@ -39,7 +39,7 @@ def test_layouts_are_read_by_the_readers_of_real_data(out):
         sequence = kitti.Sequence(out / "kitti", name)
         assert len(sequence) == SMALL["frames"]
         np.testing.assert_allclose(np.diff(sequence.times), 0.1, atol=1e-9)
-        for index, frame in enumerate(sequence.frames()):
+        for index, frame in enumerate(sequence):
             labels = cityscapes.read_label_map(sequence.folder / "labels_0" / f"{index:06d}.png")
             assert labels.shape == frame.shape == sequence.size
     for split, count in (("train", SMALL["train_images"]), ("val", SMALL["validation_images"])):

@@ -1,10 +1,10 @@
 """KITTI odometry: frames, camera, times and ground truth of a sequence or a raw drive."""
 
+import operator
 from collections.abc import Iterator
 from copy import copy
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -20,6 +20,7 @@ from thesis_repro.data.layout import (
     say_once,
     sequences_folder,
 )
+from thesis_repro.data.memory import FRAME_TIME, ArraySequence, distances, step_lengths
 from thesis_repro.data.trajectories import (
     have_times,
     read_line,
@@ -28,6 +29,7 @@ from thesis_repro.data.trajectories import (
     read_times,
 )
 from thesis_repro.errors import InputError
+from thesis_repro.running import provenance
 from thesis_repro.running.files import read_gray
 
 # names of cameras' lines in the calibration
@@ -40,7 +42,6 @@ TRUE_LABELS = "labels_0"  # exact label maps beside image_0, which only the embe
 # the border's edge
 BORDER_MARGIN = 10
 BORDER_SAMPLES, BLACK = 12, 8  # frames, and the largest gray value of a border
-FRAME_TIME = 0.1  # seconds between frames, assumed for a sequence without times.txt
 
 
 def sequences(root: str | Path) -> list[str]:
@@ -84,12 +85,16 @@ class Sequence:
     `has_truth` is False. The ground truth belongs to the camera of image_0; the camera of image_2
     is 6 cm beside it. The constructor reads and checks all files except the frames. Raises
     InputError, naming the file, if a file is missing or malformed.
+
+    `Sequence.from_arrays(frames, intrinsics, ...)` is for frames in memory.
     """
+
+    from_arrays = ArraySequence
 
     def __init__(
         self,
         root: str | Path | None,
-        name: str | Path,
+        name: str | int | Path,
         camera: str | None = None,
         speed: float | None = None,
         fps: float | None = None,
@@ -98,7 +103,7 @@ class Sequence:
     ) -> None:
         """Find, read and check the files of a sequence, except its frames.
 
-        root: folder that holds sequences and poses. name: the sequence, "06" or "6".
+        root: folder that holds sequences and poses. name: the sequence, "06", "6" or 6.
         For a sequence outside of KITTI, root is None and name is a folder. The folder is a raw
         drive, or holds calib.txt, the frames (in image_0 or in the folder itself) and optionally
         times.txt and poses.txt.
@@ -108,7 +113,7 @@ class Sequence:
         have. calibration: file of a camera, see `cameras.read_camera`; its distortion is taken out
         of the frames.
         """
-        self.root, self.folder, self.poses_path = locate(root, name)
+        self.root, self.folder, self.poses_path = locate(root, str(name))
         if truth is not None:
             self.poses_path = Path(truth)
         self.name, self.speed = self.folder.name, speed
@@ -195,6 +200,16 @@ class Sequence:
         return self._poses
 
     @property
+    def scales(self) -> np.ndarray:
+        """Distances between the true positions of consecutive frames, (n,), metres; the first is 0.
+
+        Without ground truth, they follow from the speed, or are 1.
+        """
+        if self.has_truth:
+            return distances(self.poses)
+        return step_lengths(self.times, self.speed)
+
+    @property
     def files(self) -> list[Path]:
         """All files of the sequence.
 
@@ -205,6 +220,10 @@ class Sequence:
         if kitti_raw.is_drive(self.folder):
             paths += kitti_raw.files(self.folder)
         return paths
+
+    def digest(self) -> str:
+        """What tells the sequence from others in a record of results."""
+        return provenance.digest_of_files(self.files)
 
     @property
     def label_names(self) -> list[str]:
@@ -262,8 +281,10 @@ class Sequence:
             camera, self.distortion, None, camera, size, cv2.CV_16SC2
         )
 
-    def frames(self) -> Iterator[np.ndarray]:
-        """Return the frames in order."""
+    def __getitem__(self, index: int) -> np.ndarray:
+        return self.frame(operator.index(index))
+
+    def __iter__(self) -> Iterator[np.ndarray]:
         return map(self.frame, range(len(self)))
 
     def visible(self, index: int) -> np.ndarray | None:
@@ -310,20 +331,6 @@ class Sequence:
         if self.has_truth:
             short._poses = self._poses[:count]
         return short
-
-
-def scales(sequence: Sequence) -> np.ndarray:
-    """Distances between the true positions of consecutive frames, (n,), metres. The first one is 0.
-
-    Without ground truth, they follow from the speed, or are 1.
-    """
-    if sequence.has_truth:
-        steps: Any = [np.linalg.norm(step) for step in np.diff(sequence.poses[:, :3, 3], axis=0)]
-    elif sequence.speed is not None:
-        steps = sequence.speed * np.diff(sequence.times)
-    else:
-        steps = np.ones(len(sequence) - 1)
-    return np.array([0.0, *steps])
 
 
 def check_count(path: Path, count: int, frame_paths: list[Path]) -> None:

@@ -30,7 +30,6 @@ refined.motion_prior):
   otherwise "motion not determined": the previous motion, with this step's length
 """
 
-from thesis_repro.data.kitti import scales
 from thesis_repro.odometry.loop import OPENCV, Calls, Odometry
 from thesis_repro.odometry.runs import Masks, Result, run, run_many, start_pose
 from thesis_repro.odometry.settings import THESIS, OdometrySettings
@@ -49,6 +48,5 @@ __all__ = [
     "Step",
     "run",
     "run_many",
-    "scales",
     "start_pose",
 ]

@@ -8,7 +8,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 import pandas as pd
 
-from thesis_repro.data.kitti import Sequence, scales
+from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.odometry.inputs import EQUAL
 from thesis_repro.odometry.loop import STATIONARY, Calls, Odometry, detect
@@ -96,7 +96,7 @@ def run(
     check(sequence, masks)
     calls = calls or _faster_calls(len(sequence), settings)
     odometry = Odometry(sequence.intrinsics, settings, start_pose(sequence), calls)
-    step_lengths = scales(sequence)
+    step_lengths = sequence.scales
     rows = []
     for index in progress(range(len(sequence)), description):
         frame = sequence.frame(index)
@@ -140,7 +140,7 @@ def run_many(
         odometries[name] = Odometry(
             sequence.intrinsics, settings, start_pose(sequence), together.calls
         )
-    step_lengths = scales(sequence)
+    step_lengths = sequence.scales
     rows: dict[str, list[list]] = {name: [] for name in runs}
     for index in progress(range(len(sequence)), description):
         frame = sequence.frame(index)

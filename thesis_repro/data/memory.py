@@ -1,0 +1,157 @@
+"""What stands for a sequence, and a sequence whose frames are in memory."""
+
+import hashlib
+import operator
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from thesis_repro.data.geometry import are_poses
+from thesis_repro.errors import InputError
+
+FRAME_TIME = 0.1  # seconds between frames, where nobody says when they were taken
+
+
+class SequenceLike(Protocol):
+    """What stands for a sequence: any object with these names, such as one that decodes a video.
+
+    If has_truth is False, nothing asks for poses.
+    """
+
+    @property
+    def intrinsics(self) -> np.ndarray:
+        """Camera matrix, (3, 3), pixels: (fx, 0, u), (0, fy, v), (0, 0, 1)."""
+
+    @property
+    def scales(self) -> np.ndarray:
+        """Lengths of the steps, (n,), metres since the frame before; the first one is 0."""
+
+    @property
+    def has_truth(self) -> bool:
+        """Whether there are true poses."""
+
+    @property
+    def poses(self) -> np.ndarray:
+        """True camera-to-world poses, (n, 4, 4), metres. The estimate starts at the first one."""
+
+    def __len__(self) -> int:
+        """Return the number of frames, n."""
+
+    def frame(self, index: int, /) -> np.ndarray:
+        """Return frame `index`, 8-bit gray, (height, width)."""
+
+    def visible(self, index: int, /) -> np.ndarray | None:
+        """Return where keypoints may lie in it, as a mask of 0 and 255; None: everywhere."""
+
+
+class ArraySequence:
+    """A sequence of frames in memory: `Sequence.from_arrays(frames, intrinsics, ...)`."""
+
+    name = "frames in memory"
+
+    def __init__(
+        self,
+        frames: Any,
+        intrinsics: Any,
+        scales: Any = None,
+        poses: Any = None,
+        speed: float | None = None,
+        times: Any = None,
+    ) -> None:
+        """Check everything but the frames, which the odometry checks when it takes them.
+
+        frames: a list or an array, or any object with a length whose item i is frame i, (height,
+        width) uint8. intrinsics: 3x3, pixels, (fx, 0, u), (0, fy, v), (0, 0, 1).
+        How long the steps are: scales, (n,), metres since the frame before, the first one 0; or
+        poses, (n, 4, 4), true camera-to-world poses, metres; or speed, metres a second, with times,
+        (n,), seconds; or none of them, for one metre a frame.
+        Raises InputError for something else.
+        """
+        if not hasattr(frames, "__len__") or not len(frames):
+            raise InputError("frames: must be a list or an array of one frame or more")
+        if [scales is None, poses is None, speed is None].count(False) > 1:
+            raise InputError("scales, poses, speed: give one of them, for the lengths of steps")
+        if speed is not None and times is None:
+            raise InputError("speed: needs the times of the frames, in seconds")
+        count = len(frames)
+        self._frames, self.intrinsics = frames, np.array(intrinsics, float)
+        self.times = FRAME_TIME * np.arange(count)
+        if times is not None:
+            self.times = _numbers("times", times, (count,))
+        self.scales = step_lengths(self.times, speed)
+        if scales is not None:
+            self.scales = _numbers("scales", scales, (count,))
+        self.has_truth = poses is not None
+        if self.has_truth:
+            self._poses = _numbers("poses", poses, (count, 4, 4))
+            if not are_poses(self._poses).all():
+                raise InputError("poses: must be camera to world, a rotation and a position each")
+            self.scales = distances(self._poses)
+
+    @property
+    def poses(self) -> np.ndarray:
+        """True camera-to-world poses, (n, 4, 4), metres. Raises InputError if there are none."""
+        if not self.has_truth:
+            raise InputError(f"{self.name}: no poses were given; ground truth is needed")
+        return self._poses
+
+    @property
+    def frame_paths(self) -> list[Path]:
+        """There are no files. Raises InputError, so that no folder of masks is looked for."""
+        raise InputError(f"{self.name}: have no files; give their masks as a list, one a frame")
+
+    @property
+    def size(self) -> tuple[int, ...]:
+        """Size (height, width) of the first frame."""
+        return self.frame(0).shape
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def frame(self, index: int) -> np.ndarray:
+        """Frame `index`, a copy. The odometry checks what it is."""
+        return np.array(self._frames[index])
+
+    def __getitem__(self, index: int) -> np.ndarray:
+        return self.frame(operator.index(index))
+
+    def __iter__(self) -> Iterator[np.ndarray]:
+        return map(self.frame, range(len(self)))
+
+    def visible(self, index: int) -> np.ndarray | None:
+        """Where keypoints may lie in frame `index`: None, everywhere."""
+        return None
+
+    def digest(self) -> str:
+        """What tells the sequence from others in a record of results."""
+        digest = hashlib.sha256(self.intrinsics.tobytes() + self.scales.tobytes())
+        if self.has_truth:
+            digest.update(self._poses.tobytes())
+        for frame in self:
+            digest.update(frame.tobytes())
+        return digest.hexdigest()[:12]
+
+
+def distances(poses: np.ndarray) -> np.ndarray:
+    """Distances between consecutive positions of poses (n, 4, 4), (n,), metres; the first is 0."""
+    return np.array([0.0, *(np.linalg.norm(step) for step in np.diff(poses[:, :3, 3], axis=0))])
+
+
+def step_lengths(times: np.ndarray, speed: float | None) -> np.ndarray:
+    """Lengths of steps (n,), metres, at a speed, metres a second; None: 1 m. The first one is 0.
+
+    times: of the frames, (n,), seconds.
+    """
+    lengths = np.ones(len(times) - 1)
+    if speed is not None:
+        lengths = speed * np.diff(times)
+    return np.array([0.0, *lengths])
+
+
+def _numbers(name: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
+    array = np.array(values, float)
+    if array.shape != shape or not np.isfinite(array).all():
+        raise InputError(f"{name}: must be finite numbers of shape {shape}, not of {array.shape}")
+    return array
