@@ -6,7 +6,7 @@ MAKEFLAGS += --no-print-directory
 PYTHON ?= python3
 BIN := .venv/bin
 # What is set on the command line reaches Python as THESIS_REPRO_ variables, and Python names a misspelled one.
-MINE := PYTHON GPU LABELS CAMVID PSEUDO LISTEN RUN
+MINE := PYTHON GPU CAMVID PSEUDO LISTEN RUN
 given := $(foreach name,$(.VARIABLES),$(if $(filter command line,$(origin $(name))),$(name)))
 $(foreach name,$(filter-out $(MINE) MAKE% -%,$(sort $(given))),$(eval export THESIS_REPRO_$(name) := $$($(name))))
 # Everything runs this checkout and its environment, without the user's settings of Python, pip and Jupyter.
@@ -27,11 +27,11 @@ help:
 	@echo "make lab         open copies of the notebooks in JupyterLab with PROFILE=lab (up to two minutes each);"
 	@echo "                 in a container LISTEN=0.0.0.0"
 	@echo "make check-data  check the folders KITTI=/path CITYSCAPES=/path KITTI_SEMANTIC=/path"
-	@echo "make evidence    make figures PROFILE=thesis from KITTI=/path, and keep what shows no frame; LABELS='/path /path'"
+	@echo "make evidence    make figures PROFILE=thesis from KITTI=/path, and keep what shows no frame"
 	@echo "make trainings   after make figures: train nine more networks, and compare masks from all ten (some ten minutes)"
 	@echo "make bench       measure the relative cost of odometry and network (KITTI=/path), into build/bench.json"
 	@echo "make weights     train the shipped model anew into build/shipped, CAMVID=/path KITTI_SEMANTIC=/path PSEUDO=/path"
-	@echo "make page, pins  write the page anew from the figures in git; resolve the pins of environment.txt anew"
+	@echo "make page, pins  write page, README and docs/answer.md anew from the tables in git; resolve the pins of environment.txt anew"
 	@echo "make setup       install the pinned packages into .venv (GPU=1: and CUDA); make clean: delete .venv and all results"
 
 # uv takes a third of pip's time, but ignores pip's settings, so pip follows if uv reaches no index. The options in PIP
@@ -54,6 +54,7 @@ setup: .venv/ready $(if $(filter 1,$(GPU)),.venv/ready-gpu)
 figures: setup
 	@$(BIN)/python -m thesis.figures
 page: setup
+	@$(BIN)/python tools/write_texts.py
 	@$(BIN)/python -m thesis.page
 
 # Which notebook needs what; `thesis.figures` runs this with the folder of the run. A notebook is executed again if one that
@@ -120,7 +121,8 @@ bench: setup
 	@$(BIN)/python tools/bench.py --kitti "$${THESIS_REPRO_KITTI:-build/world-demo/kitti}"
 evidence: setup
 	@THESIS_REPRO_PROFILE=thesis $(BIN)/python -m thesis.figures
-	@THESIS_REPRO_PROFILE=thesis $(BIN)/python tools/evidence.py $(foreach folder,$(LABELS),"$(folder)")
+	@THESIS_REPRO_PROFILE=thesis $(BIN)/python tools/evidence.py
+	@$(BIN)/python tools/write_texts.py
 trainings: setup
 	@$(BIN)/python tools/trainings.py
 weights: setup

@@ -2,33 +2,24 @@
 
 `make evidence KITTI=...` runs `make figures PROFILE=thesis` with all sequences of a KITTI folder
 and the label maps of the model in the package. Then this program copies the tables, the runs and
-the figures that show no frame of the data. It adds the steps on which masks fail, what the streets
-show, and masks from other label maps (LABELS=...). A stopped run resumes.
+the figures that show no frame of the data. It adds what the streets show, few keypoints, the worth
+of a keypoint, and the refined estimator with masks of every width. A stopped run resumes.
 """
 
-import sys
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
 import choices
-import failures
-import label_quality
-import reasons
-import refined_widths
-import saturation
-from keypoint_study import jobs, runner, worth
+from keypoint_study import compare, jobs, runner, worth
 from keypoint_study.report import style, texts
 from keypoint_study.report import worth as report_worth
-from keypoint_study.sources import Source, named
+from keypoint_study.sources import Source
 from thesis import few_keypoints
 from thesis.settings import ROOT, read_settings
-from thesis_repro import masks
 from thesis_repro.data import kitti
 from thesis_repro.errors import InputError
-from thesis_repro.masks import folders
 from thesis_repro.odometry import metrics
 from thesis_repro.running import program, provenance
 from thesis_repro.running.files import needed, write_text
@@ -60,11 +51,10 @@ texts.TEMPLATES.loader.searchpath.append(str(Path(__file__).parent))
 
 
 @style.applied()
-def write(settings, folder, others=()):
+def write(settings, folder):
     """Write all tables, plots and findings into a folder.
 
-    settings: of a finished `make figures` on real frames. others: further sources of label maps,
-    for some or all sequences. Raises InputError if one is for none, or if a file is missing.
+    settings: of a finished `make figures` on real frames. Raises InputError if a file is missing.
     """
     sequences = [
         kitti.Sequence(settings.kitti, name).subset(settings.sizes.frames)
@@ -72,15 +62,8 @@ def write(settings, folder, others=()):
     ]
     labels = needed(settings.build / "labels", "05_prediction")
     runs = _read(settings, "runs")
-    other_runs = _other_runs(settings, sequences, others)
-    label_masks = [
-        folders.LabelMasks(labels / sequence.name, sequence, jobs.CONTROL_WIDTH)
-        for sequence in sequences
-    ]
-    steps = pd.concat(map(failures.measure, sequences, label_masks), ignore_index=True)
     lengths = ", ".join(f"{sequence.name} ({len(sequence)} frames)" for sequence in sequences)
     note = f"odometry: real KITTI frames, {lengths}; label maps by the model in the package"
-    qualities = label_quality.table(runs, other_runs)
     few_folder = settings.build / "few_keypoints"
     few_runs = few_keypoints.measure(
         sequences, labels, few_folder, settings.jobs, few_keypoints.REPETITIONS
@@ -95,33 +78,22 @@ def write(settings, folder, others=()):
         (worth.DECIDING, 0, 200, 100),
         settings.jobs,
     )
-    why = reasons.measure(sequences, [Source(labels)], jobs.CONTROL_WIDTH)
-    of_widths = refined_widths.measure(
-        sequences, labels, settings.sizes.widths, settings.build / "refined_widths", settings.jobs
-    )
+    of_widths = runs_of_widths(settings, sequences, labels)
     streets = _streets(sequences)
     provenance.sweep(folder)
     for name in KEPT:
         _copy(settings.figures, name, folder)
     style.save_all(
         {
-            "failures": failures.figure(steps, sequences, label_masks),
             "few_keypoints": few_keypoints.figure(few, times),
-            "label_quality": label_quality.figure(qualities),
             "worth": report_worth.figure(worths),
-            "saturation": saturation.figure(worths),
-            "reasons": reasons.figure(why, worths),
         },
         {
-            "failures": failures.table(steps),
             "streets": streets,
-            "label_quality": qualities,
             "few_keypoints": few_keypoints.summary(few, times),
             "worth": report_worth.table(worths),
             "choices": choices.table(runs, few_runs, worths),
-            "saturation": saturation.table(worths),
-            "reasons": reasons.table(why, worths),
-            "refined_widths": refined_widths.table(of_widths),
+            "refined_widths": table_of_widths(of_widths),
         },
         folder,
         note,
@@ -129,7 +101,6 @@ def write(settings, folder, others=()):
     tables = {name: _read(settings, name) for name in RUNS} | {
         "few_keypoints_runs": few_runs,
         "worth_runs": worths,
-        "reasons_runs": why,
         "refined_widths_runs": of_widths,
     }
     for name, rows in tables.items():
@@ -167,29 +138,33 @@ def _copy(source, name, folder):
         write_text(folder / path.name, path.read_text(encoding="utf-8"))
 
 
-def _other_runs(settings, sequences, others):
-    """Return {source: runs with its masks} on the sequences that a source has label maps of."""
-    listed = {}
-    for source in others:
-        covered = [
-            each.name
-            for each in sequences
-            if folders.folder_of_sequence(source.folder, each.name).is_dir()
-        ]
-        if not covered:
-            wanted = ", ".join(each.name for each in sequences)
-            raise InputError(f"{source.folder}: holds no folder of label maps of {wanted}")
-        job = jobs.Job("", "masked", jobs.CONTROL_WIDTH, estimator="refined", source=source.name)
-        listed[source.name] = [
-            replace(job, sequence=name, repetition=repetition)
-            for name in covered
-            for repetition in range(settings.sizes.repetitions)
-        ]
-    folder = settings.build / "other_label_maps"
-    return {
-        name: runner.run_jobs(source_jobs, sequences, others, folder, processes=settings.jobs).table
-        for name, source_jobs in listed.items()
-    }
+def runs_of_widths(settings, sequences, labels):
+    """Run the refined estimator with all keypoints and with masks of every width, once each.
+
+    Shuffling the matched points hardly changes its paths, so one run is enough.
+    """
+    kinds = [("baseline", None), *(("masked", width) for width in settings.sizes.widths)]
+    planned = [
+        jobs.Job(sequence.name, method, width, estimator="refined")
+        for sequence in sequences
+        for method, width in kinds
+    ]
+    folder = settings.build / "refined_widths"
+    return runner.run_jobs(planned, sequences, labels, folder, processes=settings.jobs).table
+
+
+def table_of_widths(runs):
+    """Return one row a width: errors divided by those with all keypoints, and failed runs."""
+    everything = compare.of_method(runs, "baseline", "refined")
+    masked = compare.of_method(runs, "masked", "refined")
+    rows = []
+    for width, of_width in masked.groupby("dilation_width"):
+        row = {"dilation width (pixels)": int(width)}
+        row["keypoints"] = f"{of_width['mean_keypoints'].mean():.0f}"
+        for error, title in compare.JUDGING_METRICS.items():
+            row[title] = choices.ratio_text(compare.ratios(of_width, everything, error))
+        rows.append(row | {"failed runs": compare.count_failed(of_width)})
+    return pd.DataFrame(rows)
 
 
 def _streets(sequences):
@@ -217,11 +192,8 @@ def _streets(sequences):
 def main():
     """Write the evidence with the settings of the environment."""
     settings = read_settings()
-    folders = [("labels", None, Path(path)) for path in sys.argv[1:]]
-    others = named(folders, masks.MaskSettings())
-    folder = settings.build / "evidence"
-    with provenance.claimed(folder):
-        write(settings, FOLDER, others)
+    with provenance.claimed(settings.build / "evidence"):
+        write(settings, FOLDER)
         program.summary(f"tables, plots and findings: {FOLDER}")
 
 

@@ -3,19 +3,16 @@
 import shutil
 
 import keras
+import made_up
 import pandas as pd
 import pytest
 from executing import run_of
 
 import bench
 import evidence
-import moving
 import train_shipped
-from keypoint_study import compare
-from keypoint_study.sources import Source
 from thesis.settings import read_settings
 from thesis_repro.data.kitti import Sequence
-from thesis_repro.errors import InputError
 
 pytestmark = pytest.mark.slow
 
@@ -53,47 +50,23 @@ def test_the_training_writes_a_model_and_its_card(camvid_real, tmp_path, monkeyp
     )
 
 
-def test_keypoints_on_movable_things_are_counted(small_world, small_labels, tmp_path, monkeypatch):
-    monkeypatch.setattr(moving, "cores", lambda: 1)  # workers take longer to start than to run
-    table = moving.table(small_world / "kitti", small_labels, tmp_path, repetitions=1, frames=5)
-    kinds = table.set_index(["sequence", "keypoints on"])["share (%)"].unstack()
-    assert list(kinds.index) == ["00", "01"]
-    total = kinds["static things"] + kinds["movable things"]
-    assert total.tolist() == pytest.approx([100, 100], abs=0.11)
-    assert (kinds["movable things"] >= kinds["of these, people and bicycles"]).all()
-    static = table[table["keypoints on"] == "static things"]
-    assert (static["median distance (px)"] < 0.3).all()  # exact poses
-    with pytest.raises(InputError, match="nowhere"):
-        moving.table(small_world / "kitti", tmp_path / "nowhere", tmp_path)
-
-
-def test_evidence_keeps_what_shows_no_frame_and_compares_label_maps(
-    executed, small_labels, tmp_path, monkeypatch
-):
+def test_evidence_keeps_what_shows_no_frame(executed, tmp_path, monkeypatch):
     shutil.copytree(executed, tmp_path / "run", symlinks=True)
     settings = read_settings(run_of(tmp_path / "run"))
-    (tmp_path / "exact").mkdir()
-    (tmp_path / "exact/01").symlink_to(small_labels / "01")  # a further source for one sequence
-    others = [Source(tmp_path / "exact", name="exact")]
     out = tmp_path / "out"
     monkeypatch.setattr(evidence.worth, "MAX_STEPS", 1)
     monkeypatch.setattr(evidence.worth, "SPLITS", 1)
     monkeypatch.setattr(evidence.few_keypoints, "TIMED_RUNS", 1)
     monkeypatch.setattr(evidence.few_keypoints, "REPETITIONS", 1)
     monkeypatch.setattr(evidence.few_keypoints, "NUMBERS", (50, 200))
-    evidence.write(settings, out, others)
+    evidence.write(settings, out)
     names = {
         "README",
-        "failures",
-        "label_quality",
         "streets",
         "few_keypoints",
         "worth",
         "worth_runs",
         "choices",
-        "reasons",
-        "reasons_runs",
-        "saturation",
         "refined_widths",
         "refined_widths_runs",
         "few_keypoints_runs",
@@ -101,14 +74,20 @@ def test_evidence_keeps_what_shows_no_frame_and_compares_label_maps(
         *evidence.RUNS,
     }
     assert {path.stem for path in out.iterdir()} == names
-    failures = pd.read_csv(out / "failures.csv")
-    assert list(failures["steps"][:2]) == ["00", "01"]
-    assert failures["number"][:2].sum() == failures["number"][2:].sum() == 8
-    assert (failures["tracked, masks"] < failures["tracked, all keypoints"]).all()
-    assert (failures["agreeing, masks"] <= failures["tracked, masks"]).all()
-    quality = pd.read_csv(out / "label_quality.csv")
-    assert len(quality) == 6 and list(quality["sequences"][:4]) == ["00, 01", "01", "01", "01"]
-    rotation = quality[compare.METRICS["rotation"]][:4].str.extract(r"^([\d.]+)")[0].astype(float)
-    assert rotation[3] == pytest.approx(rotation[2] / rotation[1], abs=0.02)
     streets = pd.read_csv(out / "streets.csv")
     assert (streets["frames"] == 5).all() and (streets["metres"] > 0).all()
+
+
+def test_a_sweep_has_one_row_a_width():
+    streets = [f"{number:02d}" for number in range(8)]
+    runs = made_up.runs(
+        streets,
+        lambda _, __, width: 1.2 if width == 1 else 1.0,
+        {"baseline": [None], "masked": [1, 10]},
+        repetitions=1,
+    )
+    runs.loc[(runs["dilation_width"] == 1) & (runs["sequence"] == "03"), "lost"] = 1
+    table = evidence.table_of_widths(runs).set_index("dilation width (pixels)")
+    ratio, failed = table.loc[1, ["rotational RPE, 1 frame", "failed runs"]]
+    assert ratio == "1.20 (1.20-1.20), 8 of 8 above 1" and failed == "1 of 8"
+    assert table.loc[10, "rotational RPE, 1 frame"].endswith("0 of 8 above 1")

@@ -1,0 +1,41 @@
+"""README and the answer are those of their templates, short, and follow the tables."""
+
+import cv2
+import numpy as np
+import pytest
+
+import thesis_repro as tr
+import write_texts
+from thesis.settings import ROOT
+from thesis_repro.odometry import metrics
+
+
+@pytest.mark.parametrize("template, words", [("README.md.j2", 900), ("answer.md.j2", 1200)])
+def test_texts_in_git_are_those_of_the_tables_and_short(template, words):
+    written = write_texts.WRITTEN[template].read_text(encoding="utf-8")
+    assert written.splitlines() == write_texts.render(template).splitlines()
+    assert len(written.split()) <= words
+
+
+def test_a_text_says_what_the_runs_say(monkeypatch):
+    runs = write_texts.table(f"{write_texts.REAL}runs")
+    masked = runs["method"] == "masked"
+    lower = runs.assign(**{name: runs[name].where(~masked, 1e-3) for name in ("se3", "rotation")})
+    monkeypatch.setattr(write_texts, "table", {f"{write_texts.REAL}runs": lower}.get)
+    write_texts.compared.cache_clear()
+    assert write_texts.verdict() == "lower"
+    write_texts.compared.cache_clear()
+
+
+@pytest.mark.real
+def test_a_mounting_angle_changes_the_rotation_by_a_hundredth_of_a_degree_at_most(kitti_real):
+    angle = cv2.Rodrigues(np.radians([0.3, 0, 0]))[0]
+    added = {}
+    streets = write_texts.table(f"{write_texts.REAL}streets")
+    for name, frames in streets[["sequence", "frames"]].itertuples(index=False):
+        if not name.startswith("drive"):
+            poses = tr.Sequence(kitti_real, name).subset(int(frames)).poses
+            turned = poses.copy()
+            turned[:, :3, :3] = angle.T @ poses[:, :3, :3] @ angle
+            added[name] = metrics.step_errors(turned, poses)["rotation"]
+    assert max(added, key=added.get) == "01" and 0.005 < added["01"] < 0.0105

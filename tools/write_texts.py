@@ -1,0 +1,168 @@
+"""Write README.md and docs/answer.md from docs/templates, with numbers from the tables in git.
+
+`make page` runs it, and `tools/evidence.py` at its end. A template asks the functions below for the
+row of a table, and writes its numbers. Its only conditions are the outcomes of verdicts.
+"""
+
+from functools import cache
+from typing import Any
+
+import pandas as pd
+
+from keypoint_study import compare
+from keypoint_study import worth as worths
+from keypoint_study.report import texts
+from thesis import few_keypoints
+from thesis.settings import ROOT
+from thesis_repro.running import program
+from thesis_repro.running.files import write_text
+
+TEMPLATES = ROOT / "docs" / "templates"
+WRITTEN = {"README.md.j2": ROOT / "README.md", "answer.md.j2": ROOT / "docs" / "answer.md"}
+REAL = "kitti_excerpts/"  # tables on real frames
+NAMES = ("sequence", "row", "source", "metric", "estimator")  # columns of texts, if empty, too
+
+
+@cache
+def table(name: str) -> pd.DataFrame:
+    """Return the table figures/NAME.csv, names of sequences as texts."""
+    rows = pd.read_csv(ROOT / "figures" / f"{name}.csv", dtype=dict.fromkeys(NAMES, str))
+    texts_in = rows.select_dtypes(exclude="number").columns
+    return rows.fillna(dict.fromkeys(texts_in, ""))
+
+
+def cell(name: str, column: str, row: dict[str, Any]) -> Any:
+    """Return what stands in a column of the one row of a table that has the given values."""
+    rows = table(name)
+    (value,) = rows.loc[(rows[list(row)] == pd.Series(row)).all(axis=1), column]
+    return value
+
+
+@cache
+def compared(where: str) -> pd.DataFrame:
+    """Return the comparisons of the runs on real frames, or of some of them."""
+    runs = table(f"{REAL}runs")
+    return compare.comparisons(runs.query(where) if where else runs)
+
+
+def error(
+    metric: str,
+    method: str = "masked",
+    over: str = "baseline",
+    estimator: str = "refined",
+    where: str = "",
+) -> dict[str, Any]:
+    """Return the row of `compare.comparisons` of one error, width 10. where: which runs."""
+    rows = compared(where)
+    named = {"metric": metric, "method": method, "reference": over, "estimator": estimator}
+    is_row = (rows[list(named)] == pd.Series(named)).all(axis=1) & rows["tested"]
+    (row,) = rows[is_row].to_dict("records")
+    return row
+
+
+def verdict(method: str = "masked", over: str = "baseline", estimator: str = "refined") -> str:
+    """Return the verdict on both errors that decide."""
+    rows = [error(metric, method, over, estimator) for metric in compare.JUDGING_METRICS]
+    return compare.overall([row["verdict"] for row in rows])
+
+
+def of_controls() -> list[str]:
+    """Return the verdicts on masks against each control without segmentation."""
+    return [verdict(over=name) for name in compare.SEGMENTATION_FREE_CONTROLS]
+
+
+def worth(choice: str, motion: str, split: str = "fields", where: str = "") -> dict[str, Any]:
+    """Return ratio, low, high, below, n and verdict of the worth of one of 400 keypoints."""
+    rows = table(f"{REAL}worth_runs").query("number == 400 and choice == @choice")
+    (row,) = worths.typical(rows.query(where) if where else rows).to_dict("records")
+    name = f"{motion}_{split}"
+    ends = {end: row[f"{name}_{end}"] for end in ("low", "high", "below")}
+    return {"ratio": row[name], **ends, "n": row["n"], "verdict": row["verdict"]}
+
+
+def few(
+    choice: str, number: int, metric: str, estimator: str = "refined", over: str = "all"
+) -> dict[str, Any]:
+    """Return the numbers of `compare.typical_ratio` for so many keypoints, and failed runs."""
+    runs = table(f"{REAL}few_keypoints_runs").query("estimator == @estimator")
+    chosen = runs.query("choice == @choice and number == @number")
+    reference = runs.query("choice == @over and number in (0, @number)")
+    ratios = compare.ratios(chosen, reference, metric)
+    keypoints = chosen["keypoints"].mean()
+    failed = int(chosen["failed"].sum())
+    return compare.typical_ratio(ratios) | {"keypoints": keypoints, "failed": failed}
+
+
+def audit(row: str, quantity: str, metric: str = "", estimator: str = "") -> dict[str, Any]:
+    """Return value, low and high of a measurement of the audit on real frames."""
+    named = {"row": row, "quantity": quantity, "metric": metric, "estimator": estimator}
+    return {name: cell(f"{REAL}audit", name, named) for name in ("value", "low", "high")}
+
+
+def of_table_4_2(row: str, column: str) -> float:
+    """Return a number of Table 4.2 on real frames."""
+    return float(cell(f"{REAL}table_4_2", column, {"sequence": row}))
+
+
+def of_few(choice: str, number: int, column: str, name: str = f"{REAL}few_keypoints") -> Any:
+    """Return what stands in a column of the table of few keypoints. number: 0 for no limit."""
+    row = {"how chosen": few_keypoints.LABELS[choice]}
+    return cell(name, column, row | ({"keypoints": number} if number else {}))
+
+
+def of_rendered(metric: str) -> str:
+    """Return an error of 200 spread keypoints over that of all in the embedded world."""
+    text = of_few("spread", 200, f"{metric}, refined estimator", "few_keypoints")
+    return text.partition(",")[0]
+
+
+def whole(number: float) -> str:
+    """Return a number without decimals."""
+    return f"{number:.0f}"
+
+
+def two(number: float) -> str:
+    """Return a number with two decimals."""
+    return f"{number:.2f}"
+
+
+def with_interval(row: dict[str, Any]) -> str:
+    """Return "1.09 (0.98-1.32)" for a ratio, or a value, and its interval."""
+    ratio = row["ratio"] if "ratio" in row else row["value"]
+    return f"{two(ratio)} ({two(row['low'])}-{two(row['high'])})"
+
+
+def render(template: str) -> str:
+    """Return the text that a template in docs/templates gives."""
+    return texts.render(template, **{function.__name__: function for function in FUNCTIONS})
+
+
+# that templates call
+FUNCTIONS = (
+    table,
+    cell,
+    error,
+    verdict,
+    of_controls,
+    worth,
+    few,
+    of_few,
+    audit,
+    of_table_4_2,
+    of_rendered,
+    whole,
+    two,
+    with_interval,
+)
+
+
+def main() -> None:
+    """Write both texts."""
+    for template, path in WRITTEN.items():
+        write_text(path, render(template))
+
+
+texts.LOADER.searchpath.append(str(TEMPLATES))
+
+if __name__ == "__main__":
+    program.run_main(main)
