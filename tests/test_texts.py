@@ -6,7 +6,6 @@ import pytest
 
 import thesis_repro as tr
 import write_texts
-from thesis.settings import ROOT
 from thesis_repro.odometry import metrics
 
 
@@ -18,10 +17,10 @@ def test_texts_in_git_are_those_of_the_tables_and_short(template, words):
 
 
 def test_a_text_says_what_the_runs_say(monkeypatch):
-    runs = write_texts.table(f"{write_texts.REAL}runs")
+    runs = write_texts.read_table(f"{write_texts.REAL}runs")
     masked = runs["method"] == "masked"
     lower = runs.assign(**{name: runs[name].where(~masked, 1e-3) for name in ("se3", "rotation")})
-    monkeypatch.setattr(write_texts, "table", {f"{write_texts.REAL}runs": lower}.get)
+    monkeypatch.setattr(write_texts, "read_table", {f"{write_texts.REAL}runs": lower}.get)
     write_texts.compared.cache_clear()
     assert write_texts.verdict() == "lower"
     write_texts.compared.cache_clear()
@@ -31,7 +30,7 @@ def test_a_text_says_what_the_runs_say(monkeypatch):
 def test_a_mounting_angle_changes_the_rotation_by_a_hundredth_of_a_degree_at_most(kitti_real):
     angle = cv2.Rodrigues(np.radians([0.3, 0, 0]))[0]
     added = {}
-    streets = write_texts.table(f"{write_texts.REAL}streets")
+    streets = write_texts.read_table(f"{write_texts.REAL}streets")
     for name, frames in streets[["sequence", "frames"]].itertuples(index=False):
         if not name.startswith("drive"):
             poses = tr.Sequence(kitti_real, name).subset(int(frames)).poses

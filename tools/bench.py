@@ -153,7 +153,7 @@ def compile_cost():
         return [seconds(work, clock) for _ in range(2)]
 
 
-def measure(sequence):
+def cost_ratios(sequence):
     """Return a table with a row for each measurement, its reference and their ratio."""
     # loads compiled code
     odometry.run_many(sequence.subset(2), {"": (replace(THESIS, estimator=refined), None)})
@@ -191,7 +191,7 @@ def main():
         "--kitti", required=True, type=Path, help="KITTI odometry folder (sequences, poses)"
     )
     options = parser.parse_args()
-    table = measure(Sequence(options.kitti, "00").subset(FRAMES))
+    table = cost_ratios(Sequence(options.kitti, "00").subset(FRAMES))
     write_text(ROOT / "build" / "bench.json", table.to_json(orient="records", indent=1) + "\n")
     print(f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}, OpenCV {cv2.__version__}")
     print(table.to_string(index=False, float_format="{:.3g}".format))

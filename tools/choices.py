@@ -30,10 +30,12 @@ ALL_OF_THEM = {"masks, filled": ("filled", 0)}
 ALL_OF_THEM |= {methods.METHODS[name].title: name for name in ("masked", *methods.MASK_CONTROLS)}
 
 
-def table(runs: pd.DataFrame, few_runs: pd.DataFrame, worths: pd.DataFrame) -> pd.DataFrame:
+def table_of_choices(
+    runs: pd.DataFrame, few_runs: pd.DataFrame, worths: pd.DataFrame
+) -> pd.DataFrame:
     """Return one row a choice and number of keypoints, with all streets and without LEFT_OUT.
 
-    runs: of a study. few_runs: of `few_keypoints.measure`. worths: of `worth.measure`. Masks and
+    runs: of a study. few_runs: of `few_keypoints.run_few`. worths: of `worth.measure`. Masks and
     controls have all their keypoints in the runs, and DECIDING of them have the worth. Where it was
     not measured, its cells are empty.
     """

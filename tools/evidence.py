@@ -65,10 +65,10 @@ def write(settings, folder):
     lengths = ", ".join(f"{sequence.name} ({len(sequence)} frames)" for sequence in sequences)
     note = f"odometry: real KITTI frames, {lengths}; label maps by the model in the package"
     few_folder = settings.build / "few_keypoints"
-    few_runs = few_keypoints.measure(
+    few_runs = few_keypoints.run_few(
         sequences, labels, few_folder, settings.jobs, few_keypoints.REPETITIONS
     )
-    few = few_keypoints.table(few_runs)
+    few = few_keypoints.ratios_to_all(few_runs)
     times = few_keypoints.time_steps(sequences[0], labels, few_folder)
     worths = worth.measure(
         sequences,
@@ -85,14 +85,14 @@ def write(settings, folder):
         _copy(settings.figures, name, folder)
     style.save_all(
         {
-            "few_keypoints": few_keypoints.figure(few, times),
+            "few_keypoints": few_keypoints.figure_of_few(few, times),
             "worth": report_worth.figure(worths),
         },
         {
             "streets": streets,
-            "few_keypoints": few_keypoints.summary(few, times),
+            "few_keypoints": few_keypoints.table_of_few(few, times),
             "worth": report_worth.table(worths),
-            "choices": choices.table(runs, few_runs, worths),
+            "choices": choices.table_of_choices(runs, few_runs, worths),
             "refined_widths": table_of_widths(of_widths),
         },
         folder,

@@ -24,7 +24,7 @@ NAMES = ("sequence", "row", "source", "metric", "estimator")  # columns of texts
 
 
 @cache
-def table(name: str) -> pd.DataFrame:
+def read_table(name: str) -> pd.DataFrame:
     """Return the table figures/NAME.csv, names of sequences as texts."""
     rows = pd.read_csv(ROOT / "figures" / f"{name}.csv", dtype=dict.fromkeys(NAMES, str))
     texts_in = rows.select_dtypes(exclude="number").columns
@@ -33,7 +33,7 @@ def table(name: str) -> pd.DataFrame:
 
 def cell(name: str, column: str, row: dict[str, Any]) -> Any:
     """Return what stands in a column of the one row of a table that has the given values."""
-    rows = table(name)
+    rows = read_table(name)
     (value,) = rows.loc[(rows[list(row)] == pd.Series(row)).all(axis=1), column]
     return value
 
@@ -41,7 +41,7 @@ def cell(name: str, column: str, row: dict[str, Any]) -> Any:
 @cache
 def compared(where: str) -> pd.DataFrame:
     """Return the comparisons of the runs on real frames, or of some of them."""
-    runs = table(f"{REAL}runs")
+    runs = read_table(f"{REAL}runs")
     return compare.comparisons(runs.query(where) if where else runs)
 
 
@@ -73,7 +73,7 @@ def of_controls() -> list[str]:
 
 def worth(choice: str, motion: str, split: str = "fields", where: str = "") -> dict[str, Any]:
     """Return ratio, low, high, below, n and verdict of the worth of one of 400 keypoints."""
-    rows = table(f"{REAL}worth_runs").query("number == 400 and choice == @choice")
+    rows = read_table(f"{REAL}worth_runs").query("number == 400 and choice == @choice")
     (row,) = worths.typical(rows.query(where) if where else rows).to_dict("records")
     name = f"{motion}_{split}"
     ends = {end: row[f"{name}_{end}"] for end in ("low", "high", "below")}
@@ -84,7 +84,7 @@ def few(
     choice: str, number: int, metric: str, estimator: str = "refined", over: str = "all"
 ) -> dict[str, Any]:
     """Return the numbers of `compare.typical_ratio` for so many keypoints, and failed runs."""
-    runs = table(f"{REAL}few_keypoints_runs").query("estimator == @estimator")
+    runs = read_table(f"{REAL}few_keypoints_runs").query("estimator == @estimator")
     chosen = runs.query("choice == @choice and number == @number")
     reference = runs.query("choice == @over and number in (0, @number)")
     ratios = compare.ratios(chosen, reference, metric)
@@ -139,7 +139,7 @@ def render(template: str) -> str:
 
 # that templates call
 FUNCTIONS = (
-    table,
+    read_table,
     cell,
     error,
     verdict,

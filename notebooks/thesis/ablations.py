@@ -154,7 +154,7 @@ def run_choices(
     return run_all(runs, folder, made_from=made_from, processes=processes).table
 
 
-def measure(
+def run_ablations(
     sequences: list[Sequence], labels: Path, folder: Path, repetitions: int = 1, processes: int = 1
 ) -> pd.DataFrame:
     """Run every ablation on every sequence with ESTIMATORS, see `run_choices`.

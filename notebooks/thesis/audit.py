@@ -1,9 +1,9 @@
 """The audit: where the thesis contradicts itself, its code or its libraries, and what that does.
 
 audit.json holds the rows. A measurement is one line of a row's numbers: notebook 09,
-`audit_of_tables` and `audit_of_data` make them, and `table` joins them to the rows. Ratios come
-from `study.compare`. Intervals of other means are those of Student's t over `n` values: sequences
-unless said otherwise.
+`audit_of_tables` and `audit_of_data` make them, and `audit_table` joins them to the rows. Ratios
+come from `keypoint_study.compare`. Intervals of other means are those of Student's t over `n`
+values: sequences unless said otherwise.
 """
 
 import json
@@ -75,7 +75,7 @@ def ratio(
     )
 
 
-def table(measurements: list[dict[str, Any]], data: str = "this run") -> pd.DataFrame:
+def audit_table(measurements: list[dict[str, Any]], data: str = "this run") -> pd.DataFrame:
     """Return the audit as a table with one line a measurement.
 
     The first line of each row has the row's texts. data: the origin of measurements that name none.

@@ -32,16 +32,16 @@ UNMASKED = "all keypoints"  # in the table of times
 FRAMES = 12  # of each sequence whose label maps are compared with the exact ones
 
 
-def measure(
+def measurements_of_run(
     settings: Settings, drives: list[Sequence], repetitions: int, pairs: int
 ) -> list[dict[str, Any]]:
-    """Return the measurements of all rows that are not live, for `audit.table`.
+    """Return the measurements of all rows that are not live, for `audit.audit_table`.
 
     drives: the sequences of the ablations. repetitions: of each ablation. pairs: of frames of each
     sequence whose keypoints and boundaries are measured one by one. Writes ablations.csv.
     """
     labels = artefacts.needed("labels", "05_prediction")
-    ablated = ablations.measure(
+    ablated = ablations.run_ablations(
         drives, labels, settings.build / "audit", repetitions, settings.jobs
     )
     artefacts.write_text("ablations.csv", ablated.to_csv(index=False))

@@ -157,17 +157,17 @@ def _of_changes(metric: str) -> list[dict[str, Any]]:
         measurement("4", "sequences with a larger error", larger, "sequences", metric=metric),
         measurement("41", "sequences improved", improved, "sequences", metric=metric),
         measurement("41", on_average, by_chance, "sequences", metric=metric),
-        measurement("41", probability, 100 * _sign_test(metric, WIDTHS_TRIED), "%", metric=metric),
+        measurement("41", probability, 100 * _sign_test(metric), "%", metric=metric),
     ]
 
 
-def _sign_test(metric: str, widths: float) -> float:
-    """Return how probable it is that the best of some widths improves no more sequences.
+def _sign_test(metric: str) -> float:
+    """Return how probable it is that the best of WIDTHS_TRIED improves no more sequences.
 
     They are those of the thesis, for masks that do nothing and independent widths.
     """
-    change = CHANGES[metric]
-    improved, by_chance = int((change < 0).sum()), widths / (widths + 1)
+    change, by_chance = CHANGES[metric], WIDTHS_TRIED / (WIDTHS_TRIED + 1)
+    improved = int((change < 0).sum())
     return float(binomtest(improved, len(change), by_chance, alternative="less").pvalue)
 
 
@@ -215,7 +215,7 @@ def of_study(runs: pd.DataFrame, shuffled: pd.DataFrame) -> list[dict[str, Any]]
 def _of_best_widths(
     runs: pd.DataFrame, best: pd.DataFrame, shuffled: pd.DataFrame
 ) -> list[dict[str, Any]]:
-    """Return rows 2, 31, 35, 39 and 41. best: the runs with masks of each sequence's best width."""
+    """Return rows 2, 31, 35 and 39. best: the runs with masks of each sequence's best width."""
     masked, every = compare.of_method(runs, "masked"), compare.of_method(runs, "baseline")
     stability = section_4_2.stability(masked, every)
     by_width = masked.groupby(["sequence", "dilation_width"])[["rmse", "mae"]].mean()
@@ -233,7 +233,6 @@ def _of_best_widths(
         ratio("2", f"{best_of}, other repetitions", stability["elsewhere"], metric="RMSE"),
         share("2", "pairs of repetitions with the same best width", stability["same_best"]),
         *_of_null_distribution(shuffled, masked["dilation_width"].nunique()),
-        *_of_alike_widths(masked, shuffled),
     ]
 
 
@@ -252,26 +251,8 @@ def _of_null_distribution(shuffled: pd.DataFrame, widths: int) -> list[dict[str,
     return [*measurements, measurement("39", quantity, as_low, "%", metric="RMSE")]
 
 
-def _of_alike_widths(masked: pd.DataFrame, shuffled: pd.DataFrame) -> list[dict[str, Any]]:
-    """Return row 41: how many widths count as independent, and what this does to its test."""
-    correlation, widths = section_4_2.independent_widths(masked, shuffled, "rmse")
-    chance = 100 * _sign_test("RMSE", widths)
-    alike = "correlation of the errors of two widths, about the mean of all keypoints"
-    so_few = (
-        "probability of no more improved sequences in the thesis if masks did nothing and so few "
-        "widths were independent"
-    )
-    return [
-        measurement("41", alike, correlation, metric="RMSE"),
-        measurement(
-            "41", "widths that count as independent (Kish)", widths, "widths", metric="RMSE"
-        ),
-        measurement("41", so_few, chance, "%", metric="RMSE"),
-    ]
-
-
 def of_ablations(runs: pd.DataFrame) -> list[dict[str, Any]]:
-    """Return the rows that follow from the runs of `ablations.measure`."""
+    """Return the rows that follow from the runs of `ablations.run_ablations`."""
     run = partial(of_method, runs)
     every, masks, half = run("baseline"), run("masked"), run("turned-into")
     no_trees = "no keypoints on vegetation and terrain, over all keypoints"
@@ -325,7 +306,9 @@ def of_ablations(runs: pd.DataFrame) -> list[dict[str, Any]]:
 
 
 def _of_shuffles(runs: pd.DataFrame) -> list[dict[str, Any]]:
-    """Return row 14."""
+    """Return row 14. Without a repetition there is no shuffled run."""
+    if runs["repetition"].nunique() < 2:
+        return []
     spread = compare.shuffle_spread(runs[runs["estimator"].isin(ESTIMATORS)])
     text = "highest over lowest error of all keypoints, shuffled"
     return [

@@ -25,7 +25,9 @@ MEASURES = {  # column: name in the table, factor, digits
 IOU = "IoU: {}"  # columns of the classes
 
 
-def measure(models: dict[str, Any], domains: dict[str, list[cityscapes.Pair]]) -> pd.DataFrame:
+def scores_of_models(
+    models: dict[str, Any], domains: dict[str, list[cityscapes.Pair]]
+) -> pd.DataFrame:
     """Measure models on domains; returns one row for each model and domain.
 
     models: Keras models by name; domains: lists of `cityscapes.Pair` by name. The images are
@@ -67,10 +69,10 @@ def labelled_frames(drives: list[kitti.Sequence]) -> list[cityscapes.Pair]:
     return pairs
 
 
-def table(scores: pd.DataFrame) -> pd.DataFrame:
+def table_of_scores(scores: pd.DataFrame) -> pd.DataFrame:
     """Return one row for each measure and class, one column for each model and domain.
 
-    scores: of `measure`. A cell is empty if the class is absent.
+    scores: of `scores_of_models`. A cell is empty if the class is absent.
     """
     measures = {
         name: (factor * scores[column]).round(digits)

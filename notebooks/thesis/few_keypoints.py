@@ -96,7 +96,7 @@ def choices(
     return chosen
 
 
-def measure(
+def run_few(
     sequences: Iterable[Sequence],
     labels: Path,
     folder: Path,
@@ -132,7 +132,7 @@ def time_steps(sequence: Sequence, labels: Path, folder: Path, frames: int = 40)
     With the thesis's estimator, one thread and the mask made from its label map, without the
     network. The choices take turns, so that other programs slow all of them alike. Random choices
     are left out, because they are drawn from all detected keypoints.
-    folder: that of `measure`, which is called before. Times in it are not measured again.
+    folder: that of `run_few`, which is called before. Times in it are not measured again.
     """
     file = folder / sequence.name / "milliseconds.csv"
     if file.is_file():
@@ -152,10 +152,10 @@ def time_steps(sequence: Sequence, labels: Path, folder: Path, frames: int = 40)
     return times
 
 
-def table(runs: pd.DataFrame) -> pd.DataFrame:
+def ratios_to_all(runs: pd.DataFrame) -> pd.DataFrame:
     """Return one row a choice, number, estimator and error: its ratio to all keypoints.
 
-    runs: of `measure`. low, high: 95 %. as_good: whether the 90 % interval is within MARGINS, and
+    runs: of `run_few`. low, high: 95 %. as_good: whether the 90 % interval is within MARGINS, and
     no more runs failed than with all keypoints (rule 4). no_worse: the same of its upper end
     (rule 5).
     """
@@ -188,9 +188,10 @@ def within(ratios: pd.Series, margin: float) -> dict[str, bool]:
     return {"as_good": is_below and bool(low > -np.log(margin)), "no_worse": is_below}
 
 
-def summary(rows: pd.DataFrame, times: pd.DataFrame | None = None) -> pd.DataFrame:
-    """Return one row a choice and number, for readers. rows: of `table`; times: `time_steps`.
+def table_of_few(rows: pd.DataFrame, times: pd.DataFrame | None = None) -> pd.DataFrame:
+    """Return one row a choice and number, for readers.
 
+    rows: of `ratios_to_all`. times: of `time_steps`.
     "as good" and "no worse" are "yes" if a rule holds for both errors and both estimators.
     """
     keys = ["choice", "number"]
@@ -214,11 +215,11 @@ def summary(rows: pd.DataFrame, times: pd.DataFrame | None = None) -> pd.DataFra
     return pd.DataFrame(lines)
 
 
-def figure(rows: pd.DataFrame, times: pd.DataFrame | None = None) -> Figure:
+def figure_of_few(rows: pd.DataFrame, times: pd.DataFrame | None = None) -> Figure:
     """Draw the ratios of both errors against the number of keypoints, and the time of a frame.
 
     Ratios near 1 are drawn once more, enlarged; arrows there mark intervals that are cut. rows: of
-    `table`. times: of `time_steps`, drawn below the errors if given.
+    `ratios_to_all`. times: of `time_steps`, drawn below the errors if given.
     """
     more = times is not None
     scales = list(product(ERRORS, (False, True)))

@@ -52,7 +52,7 @@ def write(
     }
     quality = domain_gap.label_map_quality(settings.build).round(3)
     quality = quality.filter(["domain", "images", "classes", "mean_iou", "seen"])
-    of_trainings = trainings.summary() if settings.figures_in_git else pd.DataFrame()
+    of_trainings = trainings.table_of_trainings() if settings.figures_in_git else pd.DataFrame()
     more = texts.render(
         "findings_of_thesis.md.j2",
         widths=procedure["widths"][0],

@@ -29,7 +29,6 @@ __all__ = [
     "changes",
     "changes_of_repetition",
     "chosen_widths",
-    "independent_widths",
     "is_decisive",
     "middle",
     "null_distribution",
@@ -106,26 +105,6 @@ def null_distribution(baseline: pd.DataFrame, widths: int, metric: str) -> pd.Da
         best = of_widths[np.arange(STUDIES), best_column]
         columns[name] = percent_change(errors[best], errors[benchmark])
     return pd.DataFrame(columns)
-
-
-def independent_widths(
-    masked: pd.DataFrame, shuffled: pd.DataFrame, metric: str
-) -> tuple[float, float]:
-    """Return how alike the errors of two widths are, and how many widths count as independent.
-
-    The first is the intraclass correlation of the logarithms of the errors about each sequence's
-    mean with all keypoints (shuffled). The second is Kish's effective number, n / (1 + (n - 1) r).
-    """
-    logarithms = np.log(masked.set_index(["sequence", "repetition", "dilation_width"])[metric])
-    levels = np.log(shuffled.set_index("sequence")[metric]).groupby(level=0).mean()
-    deviations = logarithms.unstack().dropna().sub(levels, axis=0, level="sequence").to_numpy()
-    number = deviations.shape[1]
-    if number < 2:
-        return np.nan, float(number)
-    squares = (deviations**2).sum(axis=1)
-    products = (deviations.sum(axis=1) ** 2 - squares) / (number - 1)
-    correlation = max(0.0, float(products.sum() / squares.sum()))
-    return correlation, number / (1 + (number - 1) * correlation)
 
 
 def middle(values: pd.Series) -> tuple[float, float]:

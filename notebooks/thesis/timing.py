@@ -57,7 +57,7 @@ def time_savings(seconds: pd.DataFrame) -> pd.Series:
     return percent_change(masked.groupby("dilation_width")["seconds"].sum(), baseline)
 
 
-def measure(
+def time_stages(
     sequence: Sequence, model: Any, width: int = CONTROL_WIDTH, frames: int = FRAMES
 ) -> pd.DataFrame:
     """Time each stage of a frame, with all keypoints and with masks.

@@ -11,7 +11,7 @@ from thesis_repro.running import provenance
 from thesis_repro.running.files import listed
 
 TABLE = ROOT / "figures" / "trainings.csv"
-NUMBERS = {  # columns of the table: their names in `summary`
+NUMBERS = {  # columns of the table: their names in `table_of_trainings`
     "keypoints": "keypoints with masks",
     "mean_iou": "mean IoU of the label maps",
     "se3_ratio": f"ratio of the {compare.METRICS['se3']}",
@@ -28,7 +28,7 @@ def read() -> pd.DataFrame:
     return pd.read_csv(TABLE)
 
 
-def summary() -> pd.DataFrame:
+def table_of_trainings() -> pd.DataFrame:
     """Return the lowest, median and highest training of each number, and how often which verdict.
 
     One row for each estimator and number.

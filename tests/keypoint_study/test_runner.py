@@ -209,7 +209,7 @@ def test_a_slow_stage_shows_in_its_row(sequence, model, monkeypatch):
     monkeypatch.setattr(
         masks, "keypoint_mask", lambda *given: (keypoint_mask(*given), time.sleep(0.3))[0]
     )
-    table = timing.measure(sequence, model, width=5, frames=2)
+    table = timing.time_stages(sequence, model, width=5, frames=2)
     assert (
         list(table.columns) == ["method", "stage", "milliseconds"]
         and (table["milliseconds"] > 0).all()

@@ -32,7 +32,7 @@ def test_one_standard_counts_streets_and_asks_rule_5_of_every_choice():
         for choice, worth in (("masks", 0.5), ("all but the boundaries", 1.0))
         for split in ("fields", "points")
     )
-    table = choices.table(runs, few_runs, worths).set_index(["streets", "choice"])
+    table = choices.table_of_choices(runs, few_runs, worths).set_index(["streets", "choice"])
     assert {streets for streets, _ in table.index} == {"all 8", "7, without 01"}
     masks, inverse = (table.loc["all 8", name] for name in ("masks", "all but the boundaries"))
     for estimator in COMPARED:

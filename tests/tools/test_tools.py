@@ -21,7 +21,7 @@ def test_bench_compares_each_measurement_with_a_reference(small_world, monkeypat
     monkeypatch.setattr(bench, "REPEATS", 1)
     monkeypatch.setattr(bench, "WIDTHS", (5,))
     monkeypatch.setattr(bench, "FIRST_USE", "import numba")  # to compile takes 18 seconds
-    table = bench.measure(Sequence(small_world / "kitti", "00").subset(5))
+    table = bench.cost_ratios(Sequence(small_world / "kitti", "00").subset(5))
     assert table["ratio"].tolist() == pytest.approx(table["measured"] / table["reference"])
     assert (table["ratio"] > 0).all() and table["what"].str.contains(" the same bits").sum() == 1
     assert table.to_json(orient="records").count('"ratio"') == 5

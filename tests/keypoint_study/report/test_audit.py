@@ -18,7 +18,6 @@ from thesis import (
     audit_of_data,
     audit_of_tables,
     domain_gap,
-    section_4_2,
     trainings,
 )
 from thesis.settings import ROOT
@@ -33,7 +32,9 @@ def test_rows_are_numbered_and_every_measurement_has_a_row():
         row[key].strip() for row in audit.ROWS for key in ("where", "does", "right", "switch")
     )
     with pytest.raises(KeyError, match="999"):
-        audit.table([audit.measurement("13", "spread", 1), audit.measurement("999", "spread", 1)])
+        audit.audit_table(
+            [audit.measurement("13", "spread", 1), audit.measurement("999", "spread", 1)]
+        )
 
 
 @pytest.mark.parametrize(
@@ -57,29 +58,11 @@ def test_rows_are_numbered_and_every_measurement_has_a_row():
     ],
 )
 def test_arithmetic_with_the_thesiss_tables(row, quantity, metric, value):
-    table = audit.table(audit_of_tables.of_reported(), "made up")
+    table = audit.audit_table(audit_of_tables.of_reported(), "made up")
     rows = table[
         (table["row"] == row) & (table["quantity"] == quantity) & (table["metric"] == metric)
     ]
     assert rows["value"].item() == pytest.approx(value, abs=0.011)
-
-
-def test_alike_widths_count_as_one_and_unlike_ones_as_all():
-    random, widths = np.random.default_rng(0), 15
-    keys = pd.MultiIndex.from_product(
-        [map(str, range(400)), [0], range(1, widths + 1)],
-        names=["sequence", "repetition", "dilation_width"],
-    )
-    of_sequence = np.repeat(random.normal(size=400), widths)
-    level = pd.DataFrame({"sequence": keys.levels[0], "rmse": np.exp(2.0)})
-    for errors, expected in (
-        (of_sequence, 1),
-        (random.normal(size=len(keys)), widths),
-        (of_sequence + random.normal(size=len(keys)), widths / (1 + (widths - 1) / 2)),
-    ):
-        masked = pd.DataFrame({"rmse": np.exp(2 + errors)}, keys).reset_index()
-        _, number = section_4_2.independent_widths(masked, level, "rmse")
-        assert number == pytest.approx(expected, rel=0.15)
 
 
 @pytest.mark.parametrize("folder", ["figures", "figures/kitti_excerpts"])
@@ -100,7 +83,7 @@ def test_rows_without_a_measurement_stay_and_words_appear_once():
         audit.measurement("13", "spread", [1, 2, 3]),
         audit.measurement("13", "spread", 5),
     ]
-    table = audit.table(measurements, "made up")
+    table = audit.audit_table(measurements, "made up")
     assert list(dict.fromkeys(table["row"])) == [row["row"] for row in audit.ROWS]
     lines = table[table["row"] == "13"]
     assert (
@@ -176,7 +159,7 @@ def test_clear_effects_are_ratios_of_errors_whose_intervals_exclude_1():
         audit.ratio("10", "no error", [0.5, 0.6] * 3, metric="keypoints"),
         audit.ratio("14", "never below 1", [1.5, 1.6] * 3, metric="RMSE"),
     ]
-    assert list(audit.clear_effects(audit.table(measurements))["quantity"]) == ["clear"]
+    assert list(audit.clear_effects(audit.audit_table(measurements))["quantity"]) == ["clear"]
 
 
 def test_right_pixels_are_counted_by_area():
@@ -238,7 +221,7 @@ SCORES["IoU: sky"] = [0.7 if row.classes == 2 else float("nan") for row in SCORE
 
 
 def test_the_table_shows_each_model_and_domain():
-    table = domain_gap.table(SCORES).set_index("measure")
+    table = domain_gap.table_of_scores(SCORES).set_index("measure")
     assert list(table) == [
         f"{OWN}: {VALIDATION}",
         f"{OWN}: {STREETS}",
