@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-import choices
 from keypoint_study import compare, jobs, runner, worth
 from keypoint_study.report import style, texts
 from keypoint_study.report import worth as report_worth
@@ -61,7 +60,6 @@ def write(settings, folder):
         for name in kitti.sequences(settings.kitti)
     ]
     labels = needed(settings.build / "labels", "05_prediction")
-    runs = _read(settings, "runs")
     lengths = ", ".join(f"{sequence.name} ({len(sequence)} frames)" for sequence in sequences)
     note = f"odometry: real KITTI frames, {lengths}; label maps by the model in the package"
     few_folder = settings.build / "few_keypoints"
@@ -92,7 +90,6 @@ def write(settings, folder):
             "streets": streets,
             "few_keypoints": few_keypoints.table_of_few(few, times),
             "worth": report_worth.table(worths),
-            "choices": choices.table_of_choices(runs, few_runs, worths),
             "refined_widths": table_of_widths(of_widths),
         },
         folder,
@@ -114,7 +111,6 @@ def write(settings, folder):
             "evidence.md.j2",
             findings=findings,
             streets=style.markdown(streets),
-            width=jobs.CONTROL_WIDTH,
             tables={
                 name: (folder / f"{name}.md").read_text(encoding="utf-8")
                 for name in KEPT
@@ -162,7 +158,8 @@ def table_of_widths(runs):
         row = {"dilation width (pixels)": int(width)}
         row["keypoints"] = f"{of_width['mean_keypoints'].mean():.0f}"
         for error, title in compare.JUDGING_METRICS.items():
-            row[title] = choices.ratio_text(compare.ratios(of_width, everything, error))
+            ratio = compare.typical_ratio(compare.ratios(of_width, everything, error))
+            row[title] = f"{texts.short(ratio)}, {ratio['above']} of {ratio['n']} above 1"
         rows.append(row | {"failed runs": compare.count_failed(of_width)})
     return pd.DataFrame(rows)
 
