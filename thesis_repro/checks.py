@@ -140,7 +140,7 @@ def sequence_warnings(sequence: kitti.Sequence) -> list[str]:
             f"sequence {sequence.name}: {sequence.calibration_path.name} has the centre {u:g}, {v:g}, far "
             f"from the middle of frames of {width}x{height} pixels; it must belong to frames of this size"
         )
-    return warnings + _step_warnings(sequence)
+    return warnings + sequence.doubts() + _step_warnings(sequence)
 
 
 def _step_warnings(sequence: kitti.Sequence) -> list[str]:

@@ -11,7 +11,7 @@ import pytest
 
 from thesis_repro import checks, odometry
 from thesis_repro.command import cli
-from thesis_repro.data import kitti, kitti_raw, layout
+from thesis_repro.data import kitti, kitti_odometry, kitti_raw, layout, trajectories
 from thesis_repro.errors import InputError
 
 
@@ -40,7 +40,7 @@ def test_colour_jpeg_frames_are_read_as_gray_with_the_colour_camera(tiny_kitti):
         )
         path.unlink()
     sequence = kitti.Sequence(tiny_kitti, "0")  # "0" stands for "00"
-    assert sequence.name == layout.locate(tiny_kitti, "0")[1].name == "00" and kitti.sequences(
+    assert sequence.name == layout.locate(tiny_kitti, "0").name == "00" and kitti.sequences(
         tiny_kitti
     ) == ["00"]
     assert np.array_equal(sequence.intrinsics, [[60, 0, 30], [0, 60, 20], [0, 0, 1]])
@@ -200,9 +200,11 @@ def test_real_drives_agree_with_their_odometry_files(kitti_real, number):
     files = raw / f"sequences/drive{number}"
     # the file has seven digits of up to 46 m
     np.testing.assert_allclose(
-        sequence.poses, kitti.read_poses(raw / f"poses/drive{number}.txt"), rtol=0, atol=6e-6
+        sequence.poses, trajectories.read_poses(raw / f"poses/drive{number}.txt"), rtol=0, atol=6e-6
     )
     # the file has microseconds
-    np.testing.assert_allclose(sequence.times, kitti.read_times(files / "times.txt"), atol=2e-6)
-    expected = kitti.read_intrinsics(files / "calib.txt", "image_2")
+    np.testing.assert_allclose(
+        sequence.times, trajectories.read_times(files / "times.txt"), atol=2e-6
+    )
+    expected = kitti_odometry.read_intrinsics(files / "calib.txt", "P2")
     assert np.array_equal(sequence.intrinsics, expected) and sequence.frame(49).shape == (375, 1242)

@@ -160,7 +160,7 @@ def study(options: Any) -> int:
     if has_labels:
         all_widths = WIDTHS if mask_settings.has_width else ()
         widths = widths.union(*options.widths or [all_widths])
-    names = dict.fromkeys(layout.locate(options.kitti, name)[1].name for name in options.sequences)
+    names = dict.fromkeys(layout.locate(options.kitti, name).name for name in options.sequences)
     planned = Study(
         options.kitti.absolute(),
         tuple(names or kitti.sequences(options.kitti)),
@@ -350,7 +350,7 @@ def _image_folders(root: Path) -> Iterator[tuple[Path, list[Path]]]:
             parent = root
         folders = layout.folders_with_frames(parent) or [root]
     for folder in folders:
-        yield folder, layout.frames_in(layout.frame_folder(folder))
+        yield folder, layout.files(folder).frames
 
 
 def _mask_settings(options: Any, has_labels: bool = True) -> Any:

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from thesis_repro.data.frames import eight_bits
 from thesis_repro.errors import InputError
 from thesis_repro.running.files import listed, progress, read_color, read_gray, read_ids
 
@@ -147,13 +148,16 @@ def _by_name(folder: Path, pattern: str, ending: str) -> dict[str, Path]:
     return {path.name.removesuffix(ending): path for path in listed(folder, pattern + ending)}
 
 
-def read_image(path: str | Path, height: int, width: int, channels: int = 1) -> np.ndarray:
+def read_image(
+    path: str | Path, height: int, width: int, channels: int = 1, white: int = 0
+) -> np.ndarray:
     """Read an image and resize it bilinearly (A.2.1): uint8 (height, width, channels).
 
-    channels: 1 for gray, as in the thesis; 3 for red, green, blue.
+    channels: 1 for gray, as in the thesis; 3 for red, green, blue. white: see `frames.white_level`.
     """
     read = read_gray if channels == 1 else read_color
-    image = resize_bilinear(read(path), (height, width))
+    image = eight_bits(read(path, np.uint16 if white else np.uint8), white)
+    image = resize_bilinear(image, (height, width))
     return image.reshape(height, width, channels)
 
 

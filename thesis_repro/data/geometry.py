@@ -9,10 +9,10 @@ from thesis_repro.errors import InputError
 
 # Intrinsics in pixels at the stated image size (Section 3.7.2); KITTI's gray images have no
 # distortion.
-Camera = namedtuple("Camera", "width height fx fy cx cy")
-_CAMERA_00 = Camera(1241, 376, 718.856, 718.856, 607.1928, 185.2157)
-_CAMERA_03 = Camera(1242, 375, 721.5377, 721.5377, 609.5593, 172.854)
-_CAMERA_04 = Camera(1226, 370, 707.0912, 707.0912, 601.8873, 183.1104)
+Pinhole = namedtuple("Pinhole", "width height fx fy cx cy")
+_CAMERA_00 = Pinhole(1241, 376, 718.856, 718.856, 607.1928, 185.2157)
+_CAMERA_03 = Pinhole(1242, 375, 721.5377, 721.5377, 609.5593, 172.854)
+_CAMERA_04 = Pinhole(1226, 370, 707.0912, 707.0912, 601.8873, 183.1104)
 CAMERAS = {
     "00": _CAMERA_00,
     "01": _CAMERA_00,

@@ -1,7 +1,7 @@
-"""KITTI odometry: frames, camera, times and ground truth of a sequence or a raw drive."""
+"""Sequences: frames, camera, times and ground truth, in any of the layouts of `layout.LAYOUTS`."""
 
 import operator
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from copy import copy
 from functools import cached_property
 from pathlib import Path
@@ -9,34 +9,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from thesis_repro.data import cameras, kitti_raw
-from thesis_repro.data.geometry import CAMERAS, check_camera, is_camera_matrix
-from thesis_repro.data.layout import (
-    IMAGE_FOLDERS,
-    folders_with_frames,
-    frame_folder,
-    frames_in,
-    locate,
-    say_once,
-    sequences_folder,
-)
+from thesis_repro.data import cameras, layout
+from thesis_repro.data.frames import eight_bits, say_once, times_in_names, white_level
+from thesis_repro.data.geometry import CAMERAS, check_camera
 from thesis_repro.data.memory import FRAME_TIME, ArraySequence, distances, step_lengths
-from thesis_repro.data.trajectories import (
-    have_times,
-    read_line,
-    read_poses,
-    read_poses_at,
-    read_times,
-)
+from thesis_repro.data.trajectories import read_truth
 from thesis_repro.errors import InputError
 from thesis_repro.running import provenance
 from thesis_repro.running.files import read_gray
 
-# names of cameras' lines in the calibration
-CALIBRATION_KEYS = {
-    **{name: f"P{name[-1]}" for name in IMAGE_FOLDERS},
-    **{name: f"P_rect_{name[-2:]}" for name in kitti_raw.IMAGE_FOLDERS},
-}
 TRUE_LABELS = "labels_0"  # exact label maps beside image_0, which only the embedded world has
 # Pixels near a border where keypoints are left out: half a window of the tracker, which would see
 # the border's edge
@@ -52,12 +33,12 @@ def sequences(root: str | Path) -> list[str]:
     """
     names = []
     for name in with_frames(root):
-        _, _, poses = locate(root, name)
+        poses = layout.poses(layout.locate(root, name))
         if name in CAMERAS or poses.exists():
             names.append(name)
     if not names:
         raise InputError(
-            f"{sequences_folder(root)}: no sequence holds frames (image_0 or image_2) and ground truth"
+            f"{layout.sequences_folder(root)}: no sequence holds frames and ground truth"
         )
     return names
 
@@ -68,23 +49,23 @@ def with_frames(root: str | Path) -> list[str]:
     KITTI publishes no ground truth for 11 to 21. Raises InputError if the folder has another
     layout.
     """
-    if not sequences_folder(root).is_dir():
+    folder = layout.sequences_folder(root)
+    if not folder.is_dir():
         raise InputError(
-            f"{root}: must be the folder that holds sequences/NN/image_0 and poses/NN.txt, or raw drives"
+            f"{root}: must be the folder that holds sequences/NN/image_0 and poses/NN.txt, or folders of "
+            "KITTI's raw drives, EuRoC or TUM RGB-D"
         )
-    return [folder.name for folder in folders_with_frames(sequences_folder(root))]
+    return [path.name for path in layout.folders_with_frames(folder)]
 
 
 class Sequence:
-    """One odometry sequence in the official layout, or one raw drive (see kitti_raw).
+    """A sequence in one of the layouts of `layout.LAYOUTS`, or a folder of own frames.
 
-    The official layout is sequences/NN/image_0, calib.txt, times.txt and poses/NN.txt.
-
-    Frames are PNG or JPEG files. Colour frames are read as gray. Without
-    times.txt, `times` assumes ten frames a second, as in KITTI. Without a file of poses,
-    `has_truth` is False. The ground truth belongs to the camera of image_0; the camera of image_2
-    is 6 cm beside it. The constructor reads and checks all files except the frames. Raises
-    InputError, naming the file, if a file is missing or malformed.
+    Frames are PNG or JPEG files. Colour frames are read as gray. Without a file of times, and
+    without times in the names of the frames, `times` assumes ten frames a second, as in KITTI.
+    Without a file of poses, `has_truth` is False. KITTI's ground truth belongs to the left gray
+    camera; the left colour camera is 6 cm beside it. The constructor reads and checks all files
+    except the frames. Raises InputError, naming the file, if a file is missing or malformed.
 
     `Sequence.from_arrays(frames, intrinsics, ...)` is for frames in memory.
     """
@@ -104,69 +85,78 @@ class Sequence:
         """Find, read and check the files of a sequence, except its frames.
 
         root: folder that holds sequences and poses. name: the sequence, "06", "6" or 6.
-        For a sequence outside of KITTI, root is None and name is a folder. The folder is a raw
-        drive, or holds calib.txt, the frames (in image_0 or in the folder itself) and optionally
-        times.txt and poses.txt.
-        camera: one of IMAGE_FOLDERS, see `frame_folder`. speed: metres a second, for a sequence
-        without ground truth; the default is one metre a frame. fps: frames a second, for a
-        sequence without times.txt. truth: file of the ground truth, in any form that poses.txt may
-        have. calibration: file of a camera, see `cameras.read_camera`; its distortion is taken out
-        of the frames.
+        For a sequence outside of a root, root is None and name is a folder.
+        camera: one of the layout's, such as image_2; the default is the left one. speed: metres a
+        second, for a sequence without ground truth; the default is one metre a frame. fps: frames a
+        second, for a sequence without a file of times. truth: file of the ground truth, in any form
+        that poses.txt may have. calibration: file of a camera, see `cameras.read_camera`; its
+        distortion is taken out of the frames.
         """
-        self.root, self.folder, self.poses_path = locate(root, str(name))
-        if truth is not None:
-            self.poses_path = Path(truth)
+        self.folder = layout.locate(root, name)
         self.name, self.speed = self.folder.name, speed
         self.border: np.ndarray | None = None  # see `without_border`
-        image_folder = frame_folder(self.folder, camera)
-        self.frame_paths = frames_in(image_folder)
-        camera_folder, self.calibration_path = image_folder, self.folder / "calib.txt"
-        self.times_path = self.folder / "times.txt"
-        if kitti_raw.is_drive(self.folder):
-            camera_folder = image_folder.parent
-            self.calibration_path = kitti_raw.calibration(self.folder)
-            self.times_path = camera_folder / kitti_raw.TIMES
+        files = layout.files(self.folder, camera)
+        self.frame_paths, self.doubts, self._others = files.frames, files.doubts, files.others
+        read_camera, self.calibration_path = files.read_camera, files.calibration
         if calibration is not None:
-            self.calibration_path = Path(calibration)
-            matrix, distortion, stated_size = cameras.read_camera(calibration)
-        else:
-            matrix = read_intrinsics(self.calibration_path, camera_folder.name)
-            distortion, stated_size = np.empty(0), None
-        self.intrinsics, self.distortion, self.stated_size = matrix, distortion, stated_size
+            read_camera, self.calibration_path = cameras.read_camera, Path(calibration)
+        lens = read_camera(self.calibration_path)
+        self.intrinsics, self.distortion, self.stated_size = lens[:3]
+        self.times_path = files.times
         self.has_times = self.times_path.exists()
-        self.times = self._read_times(self.times_path, fps)
+        self.times = self._read_times(files.read_times, fps)
+        read_poses, self.poses_path = files.read_poses, files.poses
+        if truth is not None:
+            read_poses, self.poses_path = read_truth, Path(truth)
         self.has_truth = truth is not None or self.poses_path.exists()
         if self.has_truth:
-            self._read_truth(self.poses_path)
+            indices, poses = read_poses(self.poses_path, self.times)
+            self._take_truth(indices, poses, lens.body)
         if speed is not None:
             self._check_speed(speed, self.has_times or fps is not None)
 
-    def _read_times(self, path: Path, fps: float | None) -> np.ndarray:
+    def _read_times(self, read: Callable[[Path], np.ndarray], fps: float | None) -> np.ndarray:
+        path = self.times_path
         if self.has_times:
             if fps is not None:
                 raise InputError(f"fps {fps:g}: leave it out; {path} has the times of the frames")
-            read = kitti_raw.read_times if path.name == kitti_raw.TIMES else read_times
             times = read(path)
             check_count(path, len(times), self.frame_paths)
             return times
-        if fps is None:
+        if fps is not None:
+            if not 0 < fps < np.inf:
+                raise InputError(f"fps {fps:g}: must be a number of frames a second, above 0")
+            return np.arange(len(self)) / fps
+        named = times_in_names(self.frame_paths)
+        if named is not None:
+            self.has_times = True
             say_once(
-                f"{path}: no such file, so {1 / FRAME_TIME:g} frames a second are assumed (--fps gives "
-                "another number)"
+                f"{self.folder}: the names of the frames are their times (--fps says otherwise)"
             )
-            return FRAME_TIME * np.arange(len(self))
-        if not 0 < fps < np.inf:
-            raise InputError(f"fps {fps:g}: must be a number of frames a second, above 0")
-        return np.arange(len(self)) / fps
+            return named
+        say_once(
+            f"{path}: no such file, so {1 / FRAME_TIME:g} frames a second are assumed (--fps gives another "
+            "number)"
+        )
+        return FRAME_TIME * np.arange(len(self))
 
-    def _read_truth(self, path: Path) -> None:
-        """Read the ground truth. Frames before and after poses with times are left out."""
-        is_drive = path.match(kitti_raw.OXTS)
-        if is_drive or not have_times(path):
-            self._poses = kitti_raw.read_poses(self.folder) if is_drive else read_poses(path)
-            check_count(path, len(self._poses), self.frame_paths)
+    def _take_truth(
+        self, indices: np.ndarray | None, poses: np.ndarray, body: np.ndarray | None
+    ) -> None:
+        """Take poses of the frames with these indices; None: of all frames.
+
+        Frames before and after them are left out. body: the camera's pose in the body, whose poses
+        EuRoC's files hold.
+        """
+        self._poses, path = poses, self.poses_path
+        if indices is None:
+            check_count(path, len(poses), self.frame_paths)
             return
-        indices, self._poses = read_poses_at(path, self.times)
+        if body is not None and path.suffix == ".csv":
+            self._poses = poses @ body
+            say_once(
+                f"{path}: poses of the body become the camera's by T_BS of {self.calibration_path}"
+            )
         first, end = indices[0], indices[-1] + 1
         gaps = np.setdiff1d(np.arange(first, end), indices)
         if len(gaps):
@@ -216,10 +206,7 @@ class Sequence:
         Frames and calibration, and the files of times and poses if they exist.
         """
         texts = self.calibration_path, self.times_path, self.poses_path
-        paths = [*self.frame_paths, *filter(Path.is_file, texts)]
-        if kitti_raw.is_drive(self.folder):
-            paths += kitti_raw.files(self.folder)
-        return paths
+        return [*self.frame_paths, *filter(Path.is_file, texts), *self._others]
 
     def digest(self) -> str:
         """What tells the sequence from others in a record of results."""
@@ -247,32 +234,19 @@ class Sequence:
         Raises InputError if it is unreadable or has another size.
         """
         path = self.frame_paths[index]
-        if self._white:
-            image = cv2.convertScaleAbs(read_gray(path, np.uint16), alpha=255 / self._white)
-        else:
-            image = read_gray(path)
+        image = eight_bits(read_gray(path, np.uint16 if self._white else np.uint8), self._white)
         check_size(path, image.shape, self.size)
         return self.undistorted(image)
 
     @cached_property
     def _white(self) -> int:
-        """Gray value that becomes 255: the largest one of the first frame; 0 for 8-bit frames."""
-        first = read_gray(self.frame_paths[0], np.uint16)
-        if first.dtype == np.uint8:
-            return 0
-        say_once(
-            f"{self.folder}: frames have 16 bits; {first.max()}, the first one's maximum, is white"
-        )
-        return int(first.max())
+        return white_level(self.frame_paths[0])
 
-    def undistorted(self, image: np.ndarray, interpolation: int = cv2.INTER_LINEAR) -> np.ndarray:
-        """Image of the frame's size without the camera's distortion, as OpenCV takes it out.
-
-        Frames are so already. For masks and label maps made from files, give cv2.INTER_NEAREST.
-        """
+    def undistorted(self, image: np.ndarray) -> np.ndarray:
+        """Image of the frame's size without the camera's distortion; frames are so already."""
         if not self.distortion.any():
             return image
-        return cv2.remap(image, *self._maps, interpolation)
+        return cv2.remap(image, *self._maps, cv2.INTER_LINEAR)
 
     @cached_property
     def _maps(self) -> tuple[np.ndarray, np.ndarray]:
@@ -353,18 +327,3 @@ def check_size(
         raise InputError(
             f"{path}: {size[1]}x{size[0]} pixels; {image} has {expected[1]}x{expected[0]}"
         )
-
-
-def read_intrinsics(path: str | Path, camera: str = "image_0") -> np.ndarray:
-    """Camera matrix (Equation 2.4), (3, 3), pixels.
-
-    It is the first three columns of P0, or of P1 to P3 for another camera; of a raw drive's
-    camera, of P_rect_00 to P_rect_03. Raises InputError if the line is missing, or if the camera
-    has distortion or skew.
-    """
-    form = ", f 0 u 0 0 f v 0 0 0 1 0, of a camera without distortion"
-    key = f"{CALIBRATION_KEYS.get(camera, 'P0')}:"
-    matrix = read_line(path, key, 12, form).reshape(3, 4)[:, :3]
-    if not is_camera_matrix(matrix):
-        raise InputError(f"{path}: line '{key}' must hold 12 numbers{form}")
-    return matrix

@@ -2,45 +2,90 @@
 
 Read are calibration, times and poses of a folder such as 2011_09_26/2011_09_26_drive_0005_sync.
 The three calibration files lie in the folder of the day, beside the drives. A drive may also be a
-link. `kitti.Sequence` reads the frames. Poses follow KITTI's development kit (Geiger et al., Vision
-meets robotics: The KITTI dataset, 2013).
+link. Poses follow KITTI's development kit (Geiger et al., Vision meets robotics: The KITTI dataset,
+2013).
 """
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
+from thesis_repro.data import kitti_odometry
+from thesis_repro.data.frames import Files, camera_folder, frames_in
 from thesis_repro.data.trajectories import read_line, read_text
 from thesis_repro.errors import InputError
 from thesis_repro.running.files import listed
 
+LAYOUT = "a raw drive of KITTI (image_00/data, oxts/data)"
 # left gray, left colour, then the right ones; frames and time stamps lie in them
 IMAGE_FOLDERS = ("image_00", "image_02", "image_01", "image_03")
 FRAMES, TIMES, OXTS = "data", "timestamps.txt", "oxts/data"
 EARTH_RADIUS = 6378137.0  # metres
+ACCURACY, MAX_ACCURACY = 23, 1.0  # column of the GPS's error, and metres that are too many
 
 
-def is_drive(folder: str | Path) -> bool:
-    """Return whether a folder is a raw drive.
-
-    It then has the measurements of the OXTS, a GPS with inertial sensors.
-    """
-    return (Path(folder) / OXTS).is_dir()
+def is_mine(folder: Path) -> bool:
+    """Whether a folder has the measurements of the OXTS, a GPS with inertial sensors."""
+    return (folder / OXTS).is_dir()
 
 
-def calibration(folder: str | Path, name: str = "cam_to_cam") -> Path:
+def poses(folder: Path) -> Path:
+    """Folder of the measurements that the poses are made from."""
+    return folder / OXTS
+
+
+def files(folder: Path, camera: str | None) -> Files:
+    """Files of a drive. camera: one of IMAGE_FOLDERS."""
+    image_folder = camera_folder(folder, IMAGE_FOLDERS, camera, FRAMES)
+    if image_folder is None:
+        raise InputError(
+            f"{folder}: must hold {IMAGE_FOLDERS[0]}/{FRAMES} or {IMAGE_FOLDERS[1]}/{FRAMES}"
+        )
+    key = f"P_rect_{image_folder.parent.name[-2:]}"
+    used = [calibration(folder, name) for name in ("imu_to_velo", "velo_to_cam")]
+    return Files(
+        frames_in(image_folder),
+        calibration(folder),
+        partial(kitti_odometry.read_camera, key=key),
+        image_folder.parent / TIMES,
+        poses(folder),
+        read_times,
+        partial(_read_truth, key=key),
+        (*used, *_measurements(folder)),
+        partial(_doubts, folder),
+    )
+
+
+def calibration(folder: Path, name: str = "cam_to_cam") -> Path:
     """Calibration file "cam_to_cam", "velo_to_cam" or "imu_to_velo" of a drive's day."""
-    return Path(folder).resolve().parent / f"calib_{name}.txt"
+    return folder.resolve().parent / f"calib_{name}.txt"
 
 
-def files(folder: str | Path) -> list[Path]:
-    """Files that the poses of a drive are made from, beside the calibration of its cameras."""
-    names = "imu_to_velo", "velo_to_cam"
-    return [*(calibration(folder, name) for name in names), *_measurements(folder)]
+def _measurements(folder: Path) -> list[Path]:
+    return listed(folder / OXTS, "*.txt")
 
 
-def _measurements(folder: str | Path) -> list[Path]:
-    return listed(Path(folder) / OXTS, "*.txt")
+def _doubts(folder: Path) -> list[str]:
+    """Say where the GPS was not sure of its place, so that the poses jump."""
+    paths = _measurements(folder)
+    errors = np.array([read_line(path, "", 30)[ACCURACY] for path in paths])
+    bad = np.flatnonzero(errors > MAX_ACCURACY)
+    if not len(bad):
+        return []
+    return [
+        f"{folder / OXTS}: the GPS was {errors.max():.3g} m off in {paths[errors.argmax()].name}, and more "
+        f"than {MAX_ACCURACY:g} m in {len(bad)} of {len(paths)} files, so true poses may jump"
+    ]
+
+
+def _read_truth(path: Path, times: np.ndarray, key: str) -> tuple:
+    """Read the poses of all frames; for a right camera, as `kitti_odometry.read_moved` does."""
+    folder = path.parent.parent
+    moved = read_poses(folder)
+    if key in ("P_rect_01", "P_rect_03"):
+        moved = moved @ kitti_odometry.to_camera(calibration(folder), key)
+    return None, moved
 
 
 def read_times(path: str | Path) -> np.ndarray:
@@ -59,7 +104,7 @@ def read_times(path: str | Path) -> np.ndarray:
     return times
 
 
-def read_poses(folder: str | Path) -> np.ndarray:
+def read_poses(folder: Path) -> np.ndarray:
     """Camera-to-world poses of the rectified left gray camera, (n, 4, 4), metres.
 
     The first one is the identity. Raises InputError, naming the file, if a calibration or a
@@ -72,7 +117,7 @@ def read_poses(folder: str | Path) -> np.ndarray:
     to_camera = rectify @ (scanner_to_camera @ to_scanner)
     measured = np.array([read_line(path, "", 30)[:6] for path in _measurements(folder)])
     if not len(measured):
-        raise InputError(f"{Path(folder) / OXTS}: holds no measurements, one file a frame")
+        raise InputError(f"{folder / OXTS}: holds no measurements, one file a frame")
     poses = _imu_poses(measured)
     return to_camera @ np.linalg.inv(poses[0]) @ poses @ np.linalg.inv(to_camera)
 

@@ -98,6 +98,17 @@ def read_poses(path: str | Path) -> np.ndarray:
     return poses
 
 
+def read_truth(path: Path, times: np.ndarray) -> tuple[np.ndarray | None, np.ndarray]:
+    """Read a file of poses in any of the formats.
+
+    times: of the frames, (n,), seconds. Returns as `read_poses_at`; without times in the file, None
+    and a pose a line.
+    """
+    if have_times(path):
+        return read_poses_at(path, times)
+    return None, read_poses(path)
+
+
 def have_times(path: Path) -> bool:
     """Whether the poses of a file have times: in EuRoC's format (.csv), or in TUM's."""
     lines = [line for line in read_text(path).splitlines() if line.strip() and line[0] != "#"]

@@ -32,12 +32,12 @@ def read_gray(path: str | Path, largest: type = np.uint8) -> np.ndarray:
     return _decoded(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH, largest)
 
 
-def read_color(path: str | Path) -> np.ndarray:
-    """Read one image as 8-bit red, green, blue, shape (height, width, 3).
+def read_color(path: str | Path, largest: type = np.uint8) -> np.ndarray:
+    """Read one image as red, green, blue, shape (height, width, 3), uint8.
 
-    Raises what `read_gray` raises.
+    largest: of the types of numbers, and errors, as of `read_gray`.
     """
-    pixels = _decoded(path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
+    pixels = _decoded(path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH, largest)
     return cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB)
 
 

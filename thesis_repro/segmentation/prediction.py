@@ -12,6 +12,7 @@ import tensorflow as tf
 
 from thesis_repro import segmentation
 from thesis_repro.data.cityscapes import read_image
+from thesis_repro.data.frames import white_level
 from thesis_repro.errors import InputError
 from thesis_repro.running import files, program, provenance
 from thesis_repro.segmentation import training
@@ -84,6 +85,7 @@ def write_label_maps(
                 "thesis_repro.segmentation.prediction",
                 "thesis_repro.segmentation.exact",
                 "thesis_repro.data.cityscapes",
+                "thesis_repro.data.frames",
             ),
             "arithmetic": segmentation.arithmetic(),
         }
@@ -94,11 +96,15 @@ def write_label_maps(
         batches = [pairs[start : start + batch_size] for start in range(0, len(pairs), batch_size)]
         batches = [batch for batch in batches if not all(path.is_file() for _, path in batch)]
         missing = sum(map(len, batches))
-        run, shape = _compiled(model, scale), model.input_shape[1:]
+        run = _compiled(model, scale)
+        height, width, channels = model.input_shape[1:]
+        white = white_level(paths[0]) if batches else 0
         bar = files.progress(None, "label maps", len(paths), initial=len(paths) - missing)
         with bar, ThreadPoolExecutor() as pool:
             for batch in batches:
-                images = pool.map(lambda pair: read_image(pair[0], *shape), batch)
+                images = pool.map(
+                    lambda pair: read_image(pair[0], height, width, channels, white), batch
+                )
                 label_maps = run(np.stack(list(images)))
                 list(pool.map(_write, batch, label_maps))
                 bar.update(len(batch))

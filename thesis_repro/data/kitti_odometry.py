@@ -1,0 +1,92 @@
+"""The layout of KITTI's odometry benchmark, and folders of own frames.
+
+A sequence is sequences/NN with image_0, calib.txt and times.txt; its poses are poses/NN.txt. Own
+frames lie in image_0 or in the folder itself, and poses.txt beside them.
+"""
+
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from thesis_repro.data.cameras import Camera
+from thesis_repro.data.frames import Files, camera_folder, frames_in
+from thesis_repro.data.geometry import is_camera_matrix
+from thesis_repro.data.trajectories import read_line, read_truth
+from thesis_repro.errors import InputError
+from thesis_repro.running.files import images
+
+LAYOUT = "KITTI odometry (image_0, calib.txt), or frames in the folder itself"
+# left gray, left colour, then the right ones
+IMAGE_FOLDERS = ("image_0", "image_2", "image_1", "image_3")
+
+
+def is_mine(folder: Path) -> bool:
+    """Whether a folder has a camera's, or holds images itself."""
+    return any((folder / name).is_dir() for name in IMAGE_FOLDERS) or bool(images(folder))
+
+
+def poses(folder: Path) -> Path:
+    """File of the poses: poses/NN.txt beside sequences, or else poses.txt in the folder."""
+    own = folder / "poses.txt"
+    official = folder.parent.parent / "poses" / f"{folder.name}.txt"
+    if folder.parent.name == "sequences" and (official.exists() or not own.exists()):
+        return official
+    return own
+
+
+def files(folder: Path, camera: str | None) -> Files:
+    """Files of a sequence. camera: one of IMAGE_FOLDERS."""
+    image_folder = camera_folder(folder, IMAGE_FOLDERS, camera) or folder
+    key, calibration = "P0", folder / "calib.txt"
+    if image_folder != folder:
+        key = f"P{image_folder.name[-1]}"
+    found = Files(
+        frames_in(image_folder),
+        calibration,
+        partial(read_camera, key=key),
+        folder / "times.txt",
+        poses(folder),
+    )
+    if key in ("P1", "P3"):
+        found = found._replace(read_poses=partial(read_moved, calibration=calibration, key=key))
+    return found
+
+
+def read_camera(path: Path, key: str = "P0") -> Camera:
+    """Read the camera of a line such as P0, see `read_intrinsics`."""
+    return Camera(read_intrinsics(path, key), np.empty(0))
+
+
+def read_intrinsics(path: Path, key: str = "P0") -> np.ndarray:
+    """Camera matrix (Equation 2.4), (3, 3), pixels: the first three columns of a line.
+
+    Raises InputError if the line is missing, or if the camera has distortion or skew.
+    """
+    return _projection(path, key)[:, :3]
+
+
+def _projection(path: Path, key: str) -> np.ndarray:
+    """Return the projection matrix, (3, 4), of a line. Raises what `read_intrinsics` raises."""
+    form = ", f 0 u 0 0 f v 0 0 0 1 0, of a camera without distortion"
+    projection = read_line(path, f"{key}:", 12, form).reshape(3, 4)
+    if not is_camera_matrix(projection[:, :3]):
+        raise InputError(f"{path}: line '{key}:' must hold 12 numbers{form}")
+    return projection
+
+
+def read_moved(path: Path, times: np.ndarray, calibration: Path, key: str) -> tuple:
+    """Read poses of camera 0, as `read_truth` does, and move them to a right camera.
+
+    It sees a point X of camera 0 at K X + p, so its centre is -K^-1 p, half a metre to the right.
+    (The left colour camera, 6 cm beside, has the poses of camera 0.)
+    """
+    indices, moved = read_truth(path, times)
+    return indices, moved @ to_camera(calibration, key)
+
+
+def to_camera(calibration: Path, key: str) -> np.ndarray:
+    """Pose, 4x4, of a camera in the axes of camera 0."""
+    projection, offset = _projection(calibration, key), np.eye(4)
+    offset[:3, 3] = -np.linalg.solve(projection[:, :3], projection[:, 3])
+    return offset
