@@ -304,10 +304,16 @@ def named(command: str) -> dict[str, dict[str, Any]]:
         sizes = list(street_world.SIZES)
         return {"--profile": dict(choices=sizes, default="demo", help="size of the world (demo)")}
     from thesis_repro.masks import BOUNDARIES, KINDS
-    from thesis_repro.odometry.estimators import COMPARED, DETECTORS, ESTIMATORS
+    from thesis_repro.odometry.estimators import COMPARED, ESTIMATORS
+    from thesis_repro.odometry.keypoints import DETECTORS
 
     where = ", ".join(kind.help for kind in KINDS.values())
     titles = "; ".join(f"{name}: {entry.title}" for name, entry in ESTIMATORS.items())
+    detectors = {
+        name: f"{name}: {detector.__doc__}".splitlines()[0].rstrip(".").replace("%", "%%")
+        for name, detector in DETECTORS.items()
+        if not isinstance(detector, type)  # it needs a number
+    }
     estimators: dict[str, Any] = dict(
         choices=list(ESTIMATORS),
         default="thesis",
@@ -327,9 +333,9 @@ def named(command: str) -> dict[str, dict[str, Any]]:
         ),
         "--estimator": estimators,
         "--detector": dict(
-            choices=list(DETECTORS),
+            choices=["shi-tomasi", *detectors],
             default="shi-tomasi",
-            help="keypoint detector; the tracker stays the same (shi-tomasi)",
+            help=f"what finds keypoints: {'; '.join(detectors.values())} (shi-tomasi)",
         ),
     }
 

@@ -185,6 +185,11 @@ def _paths_by_frame(folder: str | Path, sequence: Sequence, kind: str) -> list[P
     """One path a frame to its mask or label map. Raises InputError if one is missing."""
     if kind == "mask" and Path(folder).is_file():
         return [Path(folder)] * len(sequence)
+    if not hasattr(sequence, "frame_paths"):
+        raise InputError(
+            f"{folder}: the frames are not in files, so no {kind} belongs to them; give masks as a "
+            "list, one a frame"
+        )
     if sequence.distortion.any():
         raise InputError(
             f"{folder}: {kind}s of raw frames do not fit frames without distortion; undistort the frames "
