@@ -377,12 +377,52 @@ def test_masks_of_other_tools(tmp_path, name, pixels):
     assert path.name == name and np.array_equal(folders.read_mask(path), BINARY)
 
 
+def objects(*values):
+    """Three objects on a ground of 0."""
+    picture = np.zeros((48, 64, *np.shape(values[0])), np.uint16)
+    for index, value in enumerate(values):
+        picture[10:20, 20 * index : 20 * index + 10] = value
+    return picture.astype(np.uint8 if picture.max() < 256 else np.uint16)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [(1, 2, 3), (255, 1, 40), (1001, 2002, 10000), [(0, 0, 1), (0, 128, 0), (128, 128, 0)]],
+)
+def test_inverted_masks_leave_out_every_object(tiny_kitti, tmp_path, values):
+    frames = kitti.Sequence(tiny_kitti, "00")
+    cv2.imwrite(str(tmp_path / "objects.png"), objects(*values))
+    expected = np.where(objects(1, 1, 1), 0, 255)
+    masks = folders.MaskFolder(tmp_path / "objects.png", frames, invert=True)
+    assert np.array_equal(masks[2], expected)
+
+
+def test_soft_masks_have_one_limit_for_all_frames(tmp_path):
+    soft = cv2.GaussianBlur(BINARY, (9, 9), 1)
+    for brightness in (1, 0.92):
+        darker = (brightness * soft).astype(np.uint8)
+        cv2.imwrite(str(tmp_path / "a.png"), darker)
+        assert np.array_equal(folders.read_mask(tmp_path / "a.png") > 0, darker > 127)
+
+
+@pytest.mark.parametrize("name", ["masks.npz", "masks.mp4", "masks.json"])
+def test_masks_that_are_no_images_are_named(tiny_kitti, tmp_path, name):
+    frames = kitti.Sequence(tiny_kitti, "00")
+    (tmp_path / "masks").mkdir()
+    (tmp_path / "masks" / name).write_bytes(b"masks")
+    for path in (tmp_path / "masks", tmp_path / "masks" / name):
+        with pytest.raises(InputError, match=rf"{path}: .*PNG"):
+            folders.MaskFolder(path, frames)[0]
+
+
 def test_what_is_no_mask_is_named(tmp_path):
     noise = np.random.default_rng(0).integers(0, 256, BINARY.shape, np.uint8)
     for pixels, text in (
         (np.dstack([noise, noise, noise, BINARY]), "a picture and an alpha channel"),
-        (noise, "gray.*--labels"),
-        (np.repeat([[23, 11, 7, 0]], 48, axis=0).astype(np.uint8), "50% .* gray"),
+        (noise, "--labels"),
+        (np.repeat([[23, 11, 7, 0]], 48, axis=0).astype(np.uint8), "--labels"),
+        (objects(3, 200, 255), "--invert"),
+        (objects(1, 2, 3), "--invert"),
     ):
         cv2.imwrite(str(tmp_path / "a.png"), pixels)
         with pytest.raises(InputError, match=f"a.png: .*{text}"):

@@ -17,6 +17,7 @@ from thesis_repro.running import provenance
 from thesis_repro.running.files import listed, progress, read_gray, write_png
 
 ENDINGS = (".png", ".jpg", ".jpeg")  # of masks, in small or capital letters
+AREA = np.ones((5, 5), np.uint8)  # gray edges are narrower than one of a single gray value
 MAX_GRAY = 0.2  # share of a mask's pixels; label maps have more, edges of JPEG files less
 
 
@@ -108,7 +109,7 @@ class MaskFolder:
 
     One image is used for all frames if `folder` is a file, or holds a single file without the name
     of a frame.
-    invert: keypoints are allowed where the image is 0. Raises InputError if the folder or a frame's
+    invert: as in `read_mask`. Raises InputError if the folder or a frame's
     mask is missing, and as `read_mask` does.
     """
 
@@ -121,10 +122,7 @@ class MaskFolder:
         return len(self.paths)
 
     def __getitem__(self, index: int) -> np.ndarray:
-        mask = read_mask(self.paths[index], self.size)
-        if self.invert:
-            return cv2.bitwise_not(mask)
-        return mask
+        return read_mask(self.paths[index], self.size, self.invert)
 
     def record(self) -> list[Any]:
         """Return what the masks depend on beside files."""
@@ -133,24 +131,28 @@ class MaskFolder:
     def check_files(self, known: set[Any]) -> None:
         """Raise InputError if a mask cannot be read. known: files that can, added to."""
         for path in [path for path in self.paths if path not in known]:
-            read_mask(path, self.size)
+            read_mask(path, self.size, self.invert)
             known.add(path)
 
 
-def read_mask(path: str | Path, size: tuple[int, int] | None = None) -> np.ndarray:
+def read_mask(
+    path: str | Path, size: tuple[int, int] | None = None, invert: bool = False
+) -> np.ndarray:
     """Read a mask, (height, width) uint8: 0 where keypoints are forbidden, 255 elsewhere.
 
     Masks of other tools are read, too: the alpha channel of an image of one colour; any other value
-    in place of 255; of gray edges, the nearer value. size: (height, width) of its frame.
-    Raises InputError for another size, for a picture with an alpha channel, and for more gray than
-    edges have, as in a label map.
+    in place of 255; of gray edges, the nearer of 0 and 255. size: (height, width) of its frame.
+    invert: 0 allows keypoints, and any other value forbids them, such as the id or colour of an
+    object; of a JPEG file, whose values are not exact, those nearer to 255.
+    Raises InputError for another size, for a picture with an alpha channel, and if it is not plain
+    which values are meant: areas of gray, as of a label map or of several objects.
     """
     pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     if pixels is None:
         return read_gray(path)  # raises the error that says why
     mask = pixels
     if pixels.ndim == 3:
-        mask = cv2.cvtColor(pixels[..., :3], cv2.COLOR_BGR2GRAY)
+        mask = pixels[..., :3].max(axis=2)
         alpha = pixels[..., 3:]
         if (alpha != alpha[:1, :1]).any():
             if (mask != mask[0, 0]).any():
@@ -158,14 +160,20 @@ def read_mask(path: str | Path, size: tuple[int, int] | None = None) -> np.ndarr
             mask = alpha[..., 0]
     if size is not None:
         check_size(Path(path), mask.shape, size, "its frame")
-    shares = mask / max(mask.max(), 1)
-    gray = np.mean((shares > 0.1) & (shares < 0.9))
-    if gray > MAX_GRAY:
+    if invert and Path(path).suffix.lower() == ".png":
+        return np.where(mask > 0, np.uint8(0), np.uint8(255))
+    largest = max(mask.max(), 1)
+    if np.count_nonzero(np.bincount(mask.ravel())) > 2:
+        largest = np.iinfo(mask.dtype).max  # one limit for all frames
+    kept = mask > 0.5 * largest
+    is_gray = (mask > 0.1 * largest) & (mask < 0.9 * largest)
+    is_flat = cv2.erode(mask, AREA) == cv2.dilate(mask, AREA)
+    if is_gray.mean() > MAX_GRAY or (is_gray & is_flat).any() or mask.any() and not kept.any():
         raise InputError(
-            f"{path}: {gray:.0%} of its pixels are gray; a mask has 0 and 255 (label maps go with "
-            "--labels)"
+            f"{path}: holds more than two values; a mask has 0 and 255 (label maps go with --labels, "
+            "and ids of objects to ignore with --invert, as PNG)"
         )
-    return np.where(shares > 0.5, np.uint8(255), np.uint8(0))
+    return np.where(kept != invert, np.uint8(255), np.uint8(0))
 
 
 def folder_of_sequence(folder: str | Path, sequence: str) -> Path:
@@ -185,16 +193,17 @@ def _paths_by_frame(folder: str | Path, sequence: Sequence, kind: str) -> list[P
     """One path a frame to its mask or label map. Raises InputError if one is missing."""
     if kind == "mask" and Path(folder).is_file():
         return [Path(folder)] * len(sequence)
-    if not hasattr(sequence, "frame_paths"):
-        raise InputError(
-            f"{folder}: the frames are not in files, so no {kind} belongs to them; give masks as a "
-            "list, one a frame"
-        )
     if sequence.distortion.any():
         raise InputError(
             f"{folder}: {kind}s of raw frames do not fit frames without distortion; undistort the frames "
             "before their label maps are made, and leave out --calibration"
         )
+    if kind == "mask" and not _images_by_name(Path(folder)):
+        others = {path.suffix for path in listed(folder, "*") if path.is_file()}
+        if others:
+            raise InputError(
+                f"{folder}: holds {', '.join(sorted(others))}; masks are PNG or JPEG images, one for each frame"
+            )
     folder = folder_of_sequence(folder, sequence.name)
     if not folder.is_dir():
         raise InputError(

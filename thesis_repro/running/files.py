@@ -20,6 +20,8 @@ from thesis_repro.running import program
 
 # matches the names that `temporary_path` returns
 TEMPORARY = re.compile(r"\..*\.thesis-repro-[0-9a-f]{8}(\..*)?")
+# what a system puts into a folder of its own accord: Finder, NFS, a new disk
+OF_SYSTEM = re.compile(r"\.DS_Store|\._.*|\.nfs.*|lost\+found")
 DELAY = 1  # seconds before a progress bar appears
 
 
@@ -66,6 +68,8 @@ def _decoded(path: str | Path, flag: int, largest: type = np.uint8) -> np.ndarra
         raise InputError(f"{path}: cannot be read: {error.strerror}") from None
     except cv2.error:  # an empty file
         pixels = None
+    if pixels is None and Path(path).suffix.lower() not in (".png", ".jpg", ".jpeg"):
+        raise InputError(f"{path}: is no image; write a PNG image for each frame")
     if pixels is None:
         raise InputError(f"{path}: is not a complete PNG or JPEG image; copy it again")
     if not np.can_cast(pixels.dtype, largest):
@@ -79,6 +83,11 @@ def _decoded(path: str | Path, flag: int, largest: type = np.uint8) -> np.ndarra
 def listed(folder: str | Path, pattern: str = "*.png") -> list[Path]:
     """Return the files of a folder that match a pattern, in sorted order, without hidden ones."""
     return sorted(path for path in Path(folder).glob(pattern) if not path.name.startswith("."))
+
+
+def is_of_system(path: Path) -> bool:
+    """Return whether nobody put a file there: a folder with such files alone counts as empty."""
+    return bool(OF_SYSTEM.fullmatch(path.name))
 
 
 def images(folder: str | Path) -> list[Path]:
