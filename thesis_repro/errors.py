@@ -1,18 +1,30 @@
 """Bad input: the exception that every command turns into one line, and how it is raised."""
 
+from importlib.util import find_spec
+from traceback import walk_tb
 from typing import Any
 
-# modules that only some commands need, by the extra of this package that installs them
-EXTRAS = {
-    "segmentation": (
+# compiled packages that every command needs, and what installs them; any OpenCV will do
+COMPILED = {"cv2": "opencv-python-headless", "numpy": "numpy"}
+# modules that only some commands need, by what installs them
+OPTIONAL = {
+    "thesis-repro": ("keypoint_study", "street_world"),
+    "thesis-repro[segmentation]": (
         "tensorflow",
         "keras",
         "h5py",
         "segmentation_models",
         "albumentations",
     ),
-    "notebooks": ("IPython", "ipywidgets", "nbconvert", "nbformat", "latex2mathml", "livelossplot"),
-    "cluster": ("dask", "distributed"),
+    "thesis-repro[notebooks]": (
+        "IPython",
+        "ipywidgets",
+        "nbconvert",
+        "nbformat",
+        "latex2mathml",
+        "livelossplot",
+    ),
+    "thesis-repro[cluster]": ("dask", "distributed"),
 }
 
 
@@ -58,21 +70,29 @@ def need(name: str, value: object, kind: Any) -> None:
         )
 
 
-def missing_package(error: ImportError) -> InputError | None:
+def missing_package(error: ImportError | AttributeError) -> InputError | None:
     """Return an InputError that says what to install, or None if another import failed.
 
-    OpenCV is missing if none of its four distributions is installed, or if the system lacks a
-    library that the installed one needs.
+    OpenCV and NumPy also fail if the system lacks a library that they need, if some of their files
+    were removed, or if PYTHONPATH names those of another Python.
     """
-    module = (error.name or "").partition(".")[0]
-    if module == "cv2":
+    names = [frame.f_globals.get("__name__", "") for frame, _ in walk_tb(error.__traceback__)]
+    names.append(error.name or "")
+    if isinstance(error, AttributeError):  # a folder without files is imported as an empty module
+        names = [getattr(error.obj, "__name__", "")]
+        if getattr(error.obj, "__file__", None):
+            return None
+    modules = [name.partition(".")[0] for name in names]
+    for module in [module for module in reversed(modules) if module in COMPILED]:
+        spec = find_spec(module)
+        place = "not installed"
+        if spec:
+            place = spec.origin or str(spec.submodule_search_locations)
         return InputError(
-            f"OpenCV: cannot be imported ({error}); run pip install opencv-python-headless, or "
-            "another of its distributions"
+            f"{module}: cannot be imported ({place}: {' '.join(str(error).split())[:200]}); run pip "
+            f"install --force-reinstall {COMPILED[module]}, and unset PYTHONPATH if it is set"
         )
-    for extra, modules in EXTRAS.items():
-        if module in modules:
-            return InputError(
-                f'{module}: is not installed; run pip install "thesis-repro[{extra}]"'
-            )
+    for requirement, needed in OPTIONAL.items():
+        if modules[-1] in needed:
+            return InputError(f'{modules[-1]}: is not installed; run pip install "{requirement}"')
     return None

@@ -51,6 +51,7 @@ SETTINGS: dict[Any, Any] = {
     "text.parse_math": False,  # names of files and sequences may contain dollar signs
     "svg.hashsalt": "thesis-repro",  # the same figure gives the same file
     "savefig.dpi": 160,
+    "figure.max_open_warning": 0,  # a study of many sources draws more than 20
 }
 TRUTH, BASELINE, MASKED, REDUCED = BLACK, BLUE, RED, GREEN  # ground truth and methods in chapter 4
 DATES = {".svg": "Date", ".pdf": "CreationDate"}  # matplotlib's names

@@ -98,6 +98,9 @@ def odometry(options: Any) -> None:
     from thesis_repro.odometry import metrics
     from thesis_repro.odometry.estimators import ESTIMATORS
 
+    if options.plot:
+        from keypoint_study.report import paths, style
+
     settings = replace(
         odometry.THESIS,
         detector=_detector(options),
@@ -121,8 +124,6 @@ def odometry(options: Any) -> None:
         _warn([f"{sequence.poses_path}: {reason}"] * bool(reason))
     record = _record(result, sequence)
     if options.plot:
-        from keypoint_study.report import paths, style
-
         truth, poses = None, result.poses
         if sequence.has_truth:
             truth = sequence.poses
@@ -284,9 +285,10 @@ def _text(record: dict[str, Any], sequence: Any, speed: float | None) -> str:
 
 def _detector(options: Any) -> Any:
     """The detector that --detector, --spread and --fill choose; None for the thesis's."""
-    from thesis_repro.odometry.keypoints import DETECTORS, filled, spread
+    from thesis_repro.odometry.estimators import DETECTORS
+    from thesis_repro.odometry.keypoints import filled, spread
 
-    detector = DETECTORS.get(vars(options).get("detector"))  # none for the thesis's
+    detector = DETECTORS[vars(options).get("detector", "shi-tomasi")]
     if options.spread:
         if detector or vars(options).get("max_keypoints", 2000) != 2000:
             raise InputError("--spread N: goes without --max-keypoints and --detector")
@@ -420,7 +422,16 @@ def _check_outputs(options: Any, *inputs: Path | None) -> None:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command in the arguments (default: of this process), and return its exit status."""
-    arguments = sys.argv[1:] if arguments is None else arguments
+    return program.run(lambda: _call(sys.argv[1:] if arguments is None else arguments))
+
+
+def _call(arguments: list[str]) -> Any:
+    environment = Path(sys.argv[0]).resolve().parent.parent
+    if (environment / "pyvenv.cfg").is_file() and not environment.samefile(sys.prefix):
+        raise InputError(
+            f"{sys.argv[0]}: was copied, and would run the code that {sys.prefix} has; run make "
+            "clean and make setup in the copy"
+        )
     options = build_parser(COMMANDS, arguments).parse_args(arguments)
     os.environ["MPLBACKEND"] = "agg"  # commands draw only into files
-    return program.run(lambda: options.function(options))
+    return options.function(options)

@@ -1,20 +1,86 @@
 """The options of the command line. cli.py has the commands."""
 
 import argparse
+import os
 from collections.abc import Callable, Collection
+from difflib import get_close_matches
 from fractions import Fraction
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import shtab
 from joblib import cpu_count
 
 from thesis_repro.running import values
 
+
+def path(text: str) -> Path:
+    """Return a path. A shell replaces "~" only at the start of a word, not in --output=~/x."""
+    return Path(os.path.expanduser(text))
+
+
+# Options whose names stand in tables, which take a second to import: functions for `build_parser`.
+
+
+def _profile() -> dict[str, Any]:
+    import street_world
+
+    sizes = list(street_world.SIZES)
+    return dict(choices=sizes, default="demo", help="size of the world (demo)")
+
+
+def _boundaries() -> dict[str, Any]:
+    from thesis_repro.masks import BOUNDARIES
+
+    return dict(
+        metavar="|".join(BOUNDARIES),
+        default="canny",
+        help="edges by Canny or all changes of class (canny)",
+    )
+
+
+def _keep() -> dict[str, Any]:
+    from thesis_repro.masks import KINDS
+
+    where = ", ".join(kind.help for kind in KINDS.values())
+    return dict(
+        metavar="|".join(KINDS), default="boundaries", help=f"keypoints {where} (boundaries)"
+    )
+
+
+def _detector() -> dict[str, Any]:
+    from thesis_repro.odometry.estimators import DETECTORS
+
+    return dict(
+        choices=list(DETECTORS),
+        default="shi-tomasi",
+        help="keypoint detector; the tracker stays the same (shi-tomasi)",
+    )
+
+
+def _estimator() -> dict[str, Any]:
+    from thesis_repro.odometry.estimators import ESTIMATORS
+
+    titles = "; ".join(f"{name}: {entry.title}" for name, entry in ESTIMATORS.items())
+    return dict(
+        choices=list(ESTIMATORS),
+        default="thesis",
+        help=f"what estimates a motion: {titles} (thesis)",
+    )
+
+
+def _estimators() -> dict[str, Any]:
+    from thesis_repro.odometry.estimators import COMPARED
+
+    words = f"one or several ({' '.join(COMPARED)})"
+    return _estimator() | dict(nargs="+", default=list(COMPARED), help=words)
+
+
 # options of several commands, as arguments of argparse's `add_argument`
 SHARED: dict[str, dict[str, Any]] = {
     "--kitti": dict(
-        type=Path,
+        type=path,
         metavar="ROOT",
         help="KITTI folder, with sequences/ and poses/, or with raw drives",
     ),
@@ -33,7 +99,7 @@ SHARED: dict[str, dict[str, Any]] = {
         help="folder of the frames (image_0, or else image_2, read as gray; in a raw drive image_00, ...)",
     ),
     "--output": dict(
-        type=Path, dest="folder", required=True, metavar="DIR", help="folder for all results"
+        type=path, dest="folder", required=True, metavar="DIR", help="folder for all results"
     ),
     "--invert": dict(
         action="store_true", help="for --masks in which 0 keeps and other values ignore keypoints"
@@ -64,10 +130,8 @@ SHARED: dict[str, dict[str, Any]] = {
 SEQUENCE = ("--kitti", "--sequence", "--camera", "--frames")
 DILATION = dict(type=int, metavar="W", help="dilation width, in pixels, of masks from label maps")
 
-
-NAMED: dict[str, Any] = {}  # see `named`
-MASK_OPTIONS: dict[str, dict[str, Any]] = {
-    "--boundaries": NAMED,
+MASK_OPTIONS: dict[str, Any] = {
+    "--boundaries": _boundaries,
     "--symmetric": dict(
         action="store_true", help="centre masks on boundaries; the thesis's are half a pixel off"
     ),
@@ -85,7 +149,7 @@ MASK_OPTIONS: dict[str, dict[str, Any]] = {
         metavar="PIXELS",
         help="no keypoints on people and vehicles, nor within PIXELS of them (0)",
     ),
-    "--keep": NAMED,
+    "--keep": _keep,
     "--ids": dict(
         metavar="labels|train|colors|FILE",
         default="labels",
@@ -120,39 +184,39 @@ def _name_and_folder(text: str) -> tuple[str | None, Path]:
     """
     name, equals, folder = text.partition("=")
     if not equals or "/" in name or Path(text).is_dir():
-        return None, Path(text)
-    return name, Path(folder).expanduser()  # a shell replaces "~" only at the start of a word
+        return None, path(text)
+    return name, path(folder)
 
 
-# the arguments of `add_argument` for each option of each command
-COMMANDS: dict[str, dict[str, dict[str, Any]]] = {
+# the arguments of `add_argument` for each option of each command, or a function that returns them
+COMMANDS: dict[str, dict[str, Any]] = {
     "synthesize": {
         "out": dict(
-            type=Path, metavar="OUT", help="new folder, or one in which this command was stopped"
+            type=path, metavar="OUT", help="new folder, or one in which this command was stopped"
         ),
-        "--profile": NAMED,
+        "--profile": _profile,
     },
     "check-data": {
         **_shared("--kitti"),
         "--cityscapes": dict(
-            type=Path,
+            type=path,
             metavar="ROOT",
             help="Cityscapes folder (leftImg8bit/, gtFine/ or train/, ...)",
         ),
         "--kitti-semantic": dict(
-            type=Path, metavar="ROOT", help="folder of KITTI's street scenes: train/, trainannot/"
+            type=path, metavar="ROOT", help="folder of KITTI's street scenes: train/, trainannot/"
         ),
     },
     "predict": {
         **_shared("--frames", "--output"),
         "--images": dict(
-            type=Path,
+            type=path,
             required=True,
             metavar="DIR",
             help="folder of PNG or JPEG images, one sequence, or a folder of sequences, which get a subfolder each",
         ),
         "--model": dict(
-            type=Path,
+            type=path,
             metavar="FILE",
             help="trained model, .keras or .hdf5 (the model in the package)",
         ),
@@ -168,7 +232,7 @@ COMMANDS: dict[str, dict[str, dict[str, Any]]] = {
         **MASK_OPTIONS,
         **_shared("--output"),
         "--labels": dict(
-            type=Path,
+            type=path,
             required=True,
             metavar="DIR",
             help="a label map for each frame, or a folder of them for each sequence",
@@ -180,13 +244,13 @@ COMMANDS: dict[str, dict[str, dict[str, Any]]] = {
         **MASK_OPTIONS,
         **_shared("--invert", "--scale-gate", "--without-border", "--spread", "--fill"),
         "--truth": dict(
-            type=Path,
+            type=path,
             metavar="FILE",
             help="true camera-to-world poses in KITTI's, TUM's or EuRoC's format (poses/NN.txt, or poses.txt "
             "beside the frames)",
         ),
         "--calibration": dict(
-            type=Path,
+            type=path,
             metavar="FILE",
             help="camera with distortion, which is taken out: fx fy cx cy k1 k2 p1 p2 (the first four are "
             "enough), or YAML of OpenCV, ROS, EuRoC, Kalibr or ORB-SLAM (calib.txt, without distortion)",
@@ -198,18 +262,18 @@ COMMANDS: dict[str, dict[str, dict[str, Any]]] = {
             type=float, metavar="N", help="frames a second, if there is no times.txt (10)"
         ),
         "--masks": dict(
-            type=Path,
+            type=path,
             metavar="DIR",
             help="a mask for each frame or one for all: 255 keep, 0 ignore; or a folder for each sequence",
         ),
         "--labels": dict(
-            type=Path,
+            type=path,
             metavar="DIR",
             help="a label map for each frame, or a folder of them for each sequence; needs --dilation",
         ),
         "--dilation": DILATION,
-        "--estimator": NAMED,
-        "--detector": NAMED,
+        "--estimator": _estimator,
+        "--detector": _detector,
         "--max-keypoints": dict(
             type=int,
             default=2000,
@@ -217,11 +281,11 @@ COMMANDS: dict[str, dict[str, dict[str, Any]]] = {
             help="maximum number of keypoints in a frame (2000)",
         ),
         "--output": dict(
-            type=Path, metavar="POSES.txt", help="write the estimated poses in KITTI format"
+            type=path, metavar="POSES.txt", help="write the estimated poses in KITTI format"
         ),
-        "--tum": dict(type=Path, metavar="FILE", help="write the estimated poses in TUM format"),
+        "--tum": dict(type=path, metavar="FILE", help="write the estimated poses in TUM format"),
         "--plot": dict(
-            type=Path,
+            type=path,
             metavar="FILE",
             help="draw the paths and their errors (.png, .svg, .pdf, .jpg)",
         ),
@@ -281,7 +345,7 @@ COMMANDS: dict[str, dict[str, dict[str, Any]]] = {
             metavar="N",
             help="shuffles of the matched points for each run (5)",
         ),
-        "--estimator": NAMED,
+        "--estimator": _estimators,
         "--jobs": dict(
             type=values.positive_whole_number,
             default=cpu_count(),
@@ -296,48 +360,16 @@ COMMANDS: dict[str, dict[str, dict[str, Any]]] = {
 }
 
 
-def named(command: str) -> dict[str, dict[str, Any]]:
-    """Return the options whose names stand in tables, which take a second to import."""
-    if command == "synthesize":
-        import street_world
+class _Parser(argparse.ArgumentParser):
+    """A parser of one command, which names the option that a misspelled one may stand for."""
 
-        sizes = list(street_world.SIZES)
-        return {"--profile": dict(choices=sizes, default="demo", help="size of the world (demo)")}
-    from thesis_repro.masks import BOUNDARIES, KINDS
-    from thesis_repro.odometry.estimators import COMPARED, ESTIMATORS
-    from thesis_repro.odometry.keypoints import DETECTORS
-
-    where = ", ".join(kind.help for kind in KINDS.values())
-    titles = "; ".join(f"{name}: {entry.title}" for name, entry in ESTIMATORS.items())
-    detectors = {
-        name: f"{name}: {detector.__doc__}".splitlines()[0].rstrip(".").replace("%", "%%")
-        for name, detector in DETECTORS.items()
-        if not isinstance(detector, type)  # it needs a number
-    }
-    estimators: dict[str, Any] = dict(
-        choices=list(ESTIMATORS),
-        default="thesis",
-        help=f"what estimates a motion: {titles} (thesis)",
-    )
-    if command == "study":
-        default = " ".join(COMPARED)
-        estimators |= dict(nargs="+", default=list(COMPARED), help=f"one or several ({default})")
-    return {
-        "--boundaries": dict(
-            metavar="|".join(BOUNDARIES),
-            default="canny",
-            help="edges by Canny or all changes of class (canny)",
-        ),
-        "--keep": dict(
-            metavar="|".join(KINDS), default="boundaries", help=f"keypoints {where} (boundaries)"
-        ),
-        "--estimator": estimators,
-        "--detector": dict(
-            choices=["shi-tomasi", *detectors],
-            default="shi-tomasi",
-            help=f"what finds keypoints: {'; '.join(detectors.values())} (shi-tomasi)",
-        ),
-    }
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        for word in args:
+            name = word.partition("=")[0]
+            close = get_close_matches(name, self._option_string_actions)
+            if name.startswith("--") and close and close[0] != name:
+                self.error(f"{name}: no such option; did you mean {close[0]}?")
+        return super().parse_known_args(args, namespace)
 
 
 def build_parser(
@@ -357,7 +389,10 @@ def build_parser(
     parser.add_argument(
         "--version", action="version", version=f"thesis-repro {version('thesis-repro')}"
     )
-    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
+    shtab.add_argument_to(parser, help="print what completes commands and options in this shell")
+    commands = parser.add_subparsers(
+        dest="command", metavar="COMMAND", required=True, parser_class=_Parser
+    )
     examples = Path(__file__).with_name("examples.txt").read_text(encoding="utf-8").splitlines()
     for name, function in functions.items():
         own_examples = [line for line in examples if line.startswith(f"thesis-repro {name} ")]
@@ -371,11 +406,13 @@ def build_parser(
         )
         sub.set_defaults(function=function)
         mask_options = sub.add_argument_group("how masks are made from label maps")
-        if arguments is not None and name not in arguments:
+        if arguments is not None and not {name, "--print-completion"} & set(arguments):
             continue
         for option, how in COMMANDS[name].items():
             group: Any = sub
             if option in MASK_OPTIONS:
                 group = mask_options
-            group.add_argument(option, **(how or named(name)[option]))
+            added = group.add_argument(option, **(how() if callable(how) else how))
+            if added.type is path:
+                added.complete = shtab.FILE
     return parser

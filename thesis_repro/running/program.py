@@ -47,7 +47,7 @@ def explain(error: BaseException) -> str | None:
     An error of the system is told in its own words. Returns None for any other error, which
     deserves its traceback.
     """
-    if isinstance(error, ImportError):
+    if isinstance(error, (ImportError, AttributeError)):
         error = missing_package(error) or error
     if type(error).__name__ == "TerminatedWorkerError":  # of joblib, which has a page of text
         return "a process was killed, most likely because memory ran out; use fewer (--jobs, JOBS)"
@@ -68,7 +68,10 @@ def run(main: Callable[[], object]) -> int:
             signal.signal(number, _stop)
     keep_freed_memory()
     try:
-        return int(bool(main()))
+        with flushed():
+            return int(bool(main()))
+    except BrokenPipeError:
+        return 128 + signal.SIGPIPE
     except KeyboardInterrupt as stop:
         print("stopped; run the same command again to resume", file=sys.stderr)
         return 128 + int(*stop.args or [signal.SIGINT])
@@ -78,6 +81,24 @@ def run(main: Callable[[], object]) -> int:
             raise
         print(f"error: {line}", file=sys.stderr)
         return 1
+
+
+@contextmanager
+def flushed() -> Iterator[None]:
+    """Write at the end of the block what was printed in it, so that an error of that can be told.
+
+    What can no longer be written, as to `| head`, which has ended, is dropped: otherwise Python
+    tries it again, and prints a traceback.
+    """
+    try:
+        yield
+    finally:
+        if sys.stdout:
+            try:
+                sys.stdout.flush()
+            except OSError:
+                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+                raise
 
 
 def run_main(main: Callable[[], object]) -> None:

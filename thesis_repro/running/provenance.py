@@ -21,7 +21,7 @@ import pandas as pd
 
 from thesis_repro.errors import InputError
 from thesis_repro.running import program
-from thesis_repro.running.files import TEMPORARY, progress, write_text
+from thesis_repro.running.files import TEMPORARY, is_of_system, progress, write_text
 
 ROOT = Path(__file__).resolve().parents[2]  # holds the packages
 RECORD = "made-from.json"  # in the folder of a stage
@@ -40,7 +40,7 @@ def stage(folder: str | Path, *, replace: Any = True, **inputs: Any) -> Path:
         inputs = json.loads(json.dumps(inputs, default=str))
         earlier = record(folder)
         sweep(folder)
-        if earlier is None and any(folder.iterdir()):
+        if earlier is None and not all(map(is_of_system, folder.iterdir())):
             raise InputError(
                 f"{folder}: holds files that this project did not make; choose an empty or new folder"
             )
