@@ -5,19 +5,27 @@ SHELL := /bin/bash
 MAKEFLAGS += --no-print-directory
 PYTHON ?= python3
 BIN := .venv/bin
-# What is set on the command line reaches Python as THESIS_REPRO_ variables, and Python names a misspelled one.
+# A setting on the command line, or in the environment, reaches Python as a THESIS_REPRO_ variable. Python names a misspelled
+# one of the command line; of the environment, only these are taken.
+SETTINGS := KITTI CITYSCAPES KITTI_SEMANTIC PROFILE IMAGE_SIZE BASE_FILTERS BATCH_SIZE EPOCHS FRAMES WIDTHS REPETITIONS JOBS \
+            BUILD FIGURES DASK_SCHEDULER
 MINE := PYTHON GPU CAMVID PSEUDO LISTEN RUN
-given := $(foreach name,$(.VARIABLES),$(if $(filter command line,$(origin $(name))),$(name)))
-$(foreach name,$(filter-out $(MINE) MAKE% -%,$(sort $(given))),$(eval export THESIS_REPRO_$(name) := $$($(name))))
-# Everything runs this checkout and its environment, without the user's settings of Python, pip and Jupyter.
+of = $(foreach name,$(2),$(if $(filter $(1),$(origin $(name))),$(name)))
+given := $(filter-out $(MINE) MAKE% -%,$(sort $(call of,command line,$(.VARIABLES))))
+around := $(foreach name,$(call of,environment,$(SETTINGS)),$(if $(THESIS_REPRO_$(name)),,$(name)))
+$(foreach name,$(given) $(around),$(eval export THESIS_REPRO_$(name) := $$($(name))))
+ifneq ($(around),)
+$(info from the environment: $(foreach name,$(around),$(name)=$($(name))))
+endif
+# Everything runs this checkout and its environment, without the user's settings of Python, pip, Jupyter, TensorFlow.
 export PYTHONPATH := $(CURDIR):$(CURDIR)/notebooks
 export PYTHONWARNINGS := ignore
 export JUPYTER_NO_CONFIG := 1
 export JUPYTER_PREFER_ENV_PATH := 1
 export PYDEVD_DISABLE_FILE_VALIDATION := 1
-unexport PYTHONHOME PYTHONDONTWRITEBYTECODE PYTHONSTARTUP JUPYTER_PATH TF_USE_LEGACY_KERAS
+unexport PYTHONHOME PYTHONDONTWRITEBYTECODE PYTHONSTARTUP JUPYTER_PATH CDPATH TF_USE_LEGACY_KERAS XLA_FLAGS TF_XLA_FLAGS
 
-.PHONY: help setup figures notebooks page evidence trainings test torture lint lab bench weights pins clean check-data FORCE
+.PHONY: help setup figures notebooks page evidence trainings test torture lint lab bench weights pins clean check-data
 help:
 	@echo "make figures     write every table and figure to figures/, from embedded data, or from KITTI=/path CITYSCAPES=/path"
 	@echo "                 (KITTI_SEMANTIC=/path: also test the label maps); size: PROFILE=smoke|lab|demo|thesis, or single:"
@@ -40,6 +48,8 @@ PIP = $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-user
 install = $(BIN)/uv pip install --quiet --system-certs --python $(BIN)/python --no-deps $(1) || \
           { echo "uv failed, so pip is used" && $(PIP) --no-deps --no-compile $(1); }
 setup: .venv/ready $(if $(filter 1,$(GPU)),.venv/ready-gpu)
+	@$(BIN)/thesis-repro --version >/dev/null && $(BIN)/python tools/installed.py || { \
+	  echo "error: .venv no longer works: was it moved or copied, or Python upgraded? Run make clean, then make setup" >&2; exit 1; }
 .venv/ready: environment.txt pyproject.toml
 	@$(PYTHON) tools/can_install.py
 	@echo "installing the pinned packages into .venv (2.4 GB)" && $(PYTHON) -m venv .venv
@@ -58,40 +68,34 @@ page: setup
 	@$(BIN)/python -m thesis.page
 
 # Which notebook needs what; `thesis.figures` runs this with the folder of the run. A notebook is executed again if one that
-# it needs was, or if the code that it uses has changed. With real frames and no Cityscapes, the shipped model makes the
-# label maps, so nothing is rendered or trained.
+# it needs was, or if the digests of the data or of its code have changed (thesis/checked.py, thesis/used.py). With real
+# frames and no Cityscapes, the shipped model makes the label maps, so nothing is rendered or trained.
+NAMES := 01_load_images_and_labels 02_augmentation 03_unet 04_training 05_prediction 06_keypoint_masks 07_visual_odometry \
+         08_results 09_audit
 ifdef RUN
-code = $(shell find $(1) -name '*.py')
-LEARNING := $(call code,thesis_repro/data thesis_repro/segmentation street_world)
-PATHS := $(call code,thesis_repro/data thesis_repro/masks thesis_repro/odometry opencv_exact)
-DRAWING := $(filter-out %/page.py %/figures.py,$(call code,keypoint_study notebooks/thesis))
-NAMES := $(patsubst notebooks/%.ipynb,%,$(sort $(wildcard notebooks/*.ipynb)))
-NAMES := $(if $(or $(THESIS_REPRO_CITYSCAPES),$(if $(THESIS_REPRO_KITTI),,embedded)),$(NAMES),$(filter-out 01_% 02_% 04_%,$(NAMES)))
-executed = $(patsubst %,$(RUN)/notebooks/%.ipynb,$(filter $(addsuffix _%,$(1)),$(NAMES)))
-imports = $(wildcard $(patsubst %,notebooks/thesis/%.py,$(shell grep -ho 'from thesis import [a-z0-9_, ]*' $(1) | tr -d ,)))
+needed := $(if $(or $(THESIS_REPRO_CITYSCAPES),$(if $(THESIS_REPRO_KITTI),,embedded)),$(NAMES),$(filter-out 01_% 02_% 04_%,$(NAMES)))
+executed = $(patsubst %,$(RUN)/notebooks/%.ipynb,$(filter $(addsuffix _%,$(1)),$(needed)))
 
-notebooks: $(NAMES:%=$(RUN)/notebooks/%.ipynb)
-$(call executed,01 02 03 04): $(LEARNING)
-$(call executed,05 06 07): $(LEARNING) $(PATHS)
-$(call executed,08 09): $(LEARNING) $(PATHS) $(DRAWING)
+notebooks: $(needed:%=$(RUN)/notebooks/%.ipynb)
 $(call executed,02 04 05 09): $(call executed,01)
 $(call executed,04): $(call executed,02 03)
 $(call executed,05 09): $(call executed,04)
 $(call executed,06 07 08 09): $(call executed,05)
 $(call executed,07 08): $(call executed,06)
 $(call executed,09): $(call executed,08)
-$(foreach name,$(NAMES),$(eval $(RUN)/notebooks/$(name).ipynb: $(call imports,notebooks/$(name).ipynb)))
 
 # nbconvert writes under another name: a notebook that exists is done. Its kernel has nothing to do at its end.
-$(RUN)/notebooks/%.ipynb: notebooks/%.ipynb $(RUN)/checked
+$(RUN)/notebooks/%.ipynb: $(RUN)/code/% $(RUN)/checked
 	@trap 'kill $$!; exit 130' INT TERM HUP; \
-	$(BIN)/jupyter nbconvert --to notebook --execute --ExecutePreprocessor.kernel_name=python3 \
+	$(BIN)/python -m nbconvert --to notebook --execute --ExecutePreprocessor.kernel_name=python3 \
 	  --ExecutePreprocessor.timeout=-1 --ExecutePreprocessor.shutdown_kernel=immediate \
-	  --output-dir $(@D) --output .$* $< >$(@:.ipynb=.log) 2>&1 & wait $$! \
+	  --output-dir $(@D) --output .$* notebooks/$*.ipynb >$(@:.ipynb=.log) 2>&1 & wait $$! \
 	&& mv $(@D)/.$*.ipynb $@ && echo "$*: done in $$SECONDS s" \
-	|| { echo "$* failed: $$(tr -d '\033' <$(@:.ipynb=.log) | sed 's/\[[0-9;]*m//g' | grep . | tail -n 1) ($(@:.ipynb=.log))" >&2; exit 1; }
-$(RUN)/checked: FORCE  # rewritten only if the data has changed
-	@$(BIN)/python -m thesis.checked $@
+	|| { echo "$* failed: $$($(call reason,$(@:.ipynb=.log))) ($(@:.ipynb=.log))" >&2; exit 1; }
+# The last line of a log is the error, but not if the kernel died: then it is what the kernel said, or else memory ran out.
+reason = tr -d '\033' <$(1) | sed 's/\[[0-9;]*m//g' | awk '/^F[0-9]|^Fatal Python error|what\(\):/ {said = $$0} NF {last = $$0} \
+  END {print last !~ /DeadKernelError/ ? last : said ? said : "its kernel was killed, most likely because memory ran out"}'
+$(RUN)/checked $(NAMES:%=$(RUN)/code/%): ;
 # Render the drives of the embedded world and compile the shared odometry while the network is trained, to save time.
 $(call executed,05): $(if $(THESIS_REPRO_KITTI),,$(RUN)/drives)
 $(RUN)/drives: $(call executed,01)
@@ -102,18 +106,18 @@ check-data: setup
 	@$(BIN)/python -m thesis_repro check-data $${THESIS_REPRO_KITTI:+--kitti "$$THESIS_REPRO_KITTI"} \
 	  $${THESIS_REPRO_CITYSCAPES:+--cityscapes "$$THESIS_REPRO_CITYSCAPES"} $${THESIS_REPRO_KITTI_SEMANTIC:+--kitti-semantic "$$THESIS_REPRO_KITTI_SEMANTIC"}
 test: setup
-	@$(BIN)/python -m pytest -q -n logical --dist loadfile --no-loadscope-reorder
+	@$(BIN)/python -m pytest -q -n auto --dist loadfile --no-loadscope-reorder
 torture: setup
 	@$(BIN)/python -m pytest -q -m torture
 lint: setup
 	@$(BIN)/ruff format --check --quiet . && $(BIN)/ruff check . && $(BIN)/mypy && $(BIN)/lint-imports --no-logo --no-cache
 # Lessons edit copies, so that the notebooks in git stay as they are. An edited copy is kept.
-LAB := $(or $(THESIS_REPRO_BUILD),build)/lab
 lab: setup
-	@mkdir -p "$(LAB)" && cd notebooks && for path in *.ipynb thesis; do test -e "$(abspath $(LAB))/$$path" || cp -r $$path "$(abspath $(LAB))"; done
-	@echo "the notebooks are copies in $(LAB); delete one to get it anew. One that was idle for an hour loses its memory:"
-	@echo "run its cells again. Open the address below:"
-	@THESIS_REPRO_PROFILE=$(or $(THESIS_REPRO_PROFILE),lab) PYTHONPATH="$(CURDIR)" $(BIN)/jupyter lab "$(LAB)" --log-level=ERROR \
+	@lab=$$($(BIN)/python -m thesis.settings) && lab=$${lab%/*}/lab && mkdir -p "$$lab" && \
+	for path in $(NAMES:%=%.ipynb) thesis; do test -e "$$lab/$$path" || cp -r notebooks/$$path "$$lab"; done && \
+	echo "the notebooks are copies in $$lab; delete one to get it anew. One that was idle for an hour loses its memory:" && \
+	echo "run its cells again. Open the address below:" && \
+	THESIS_REPRO_PROFILE=$(or $(THESIS_REPRO_PROFILE),lab) PYTHONPATH="$(CURDIR)" $(BIN)/python -m jupyter lab "$$lab" --log-level=ERROR \
 	  --MappingKernelManager.cull_idle_timeout=3600 --MappingKernelManager.cull_connected=True \
 	  $(if $(LISTEN),--ip=$(LISTEN) --no-browser) $(if $(filter 0,$(shell id -u)),--allow-root)
 bench: setup

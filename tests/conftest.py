@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 import pytest
 import trials
+from joblib import cpu_count
 
 # The files that take longest, longest first. The evidence waits for the notebooks, which the first
 # file executes.
@@ -53,6 +54,10 @@ def pytest_collection_modifyitems(items):
     # the longest files begin first, so that all processes have work until the end
     places = {name: place for place, name in enumerate(LONGEST)}
     items.sort(key=lambda item: places.get(item.path.name, len(places)))
+
+
+def pytest_xdist_auto_num_workers():
+    return cpu_count()  # as many as the package uses: those of a container
 
 
 def pytest_collection_finish():

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from thesis import checked
+from thesis.settings import read_settings
 from thesis_repro import checks
 from thesis_repro.command.cli import main
 from thesis_repro.data.kitti import Sequence
@@ -69,13 +70,14 @@ def test_frames_that_equal_the_one_before_are_counted(tiny_kitti, capsys):
     assert "2 frames equal the frame before" in capsys.readouterr().out
 
 
-def test_unchanged_data_is_checked_once(tiny_kitti, tmp_path, monkeypatch, capsys):
-    monkeypatch.setenv("THESIS_REPRO_KITTI", str(tiny_kitti))
+def test_unchanged_data_is_checked_once(tiny_kitti, tmp_path, capsys):
+    names = {"KITTI": tiny_kitti, "BUILD": tmp_path / "build"}
+    settings = read_settings({f"THESIS_REPRO_{name}": str(path) for name, path in names.items()})
     for frame, reports in ((None, True), (None, False), (0, True)):
         if frame is not None:
             images = tiny_kitti / IMAGES
             shutil.copy(images / "000001.png", images / f"{frame:06d}.png")
-        assert checked.main(tmp_path / "checked") == 0
+        assert checked.check(settings)
         assert (str(tiny_kitti) in capsys.readouterr().out) == reports
 
 

@@ -1,11 +1,11 @@
 """A reproduction of a thesis on keypoint masks from segmentation for monocular visual odometry.
 
 The main names: Sequence, keypoint_mask, LabelMasks, Odometry, OdometrySettings, THESIS, run,
-metrics, build_unet and InputError. Names are imported on first use. Every detector of
-odometry.keypoints.DETECTORS is a name as well. TensorFlow is loaded when build_unet is called.
+build_unet and InputError. Names are imported on first use, so TensorFlow is loaded only for
+build_unet.
 """
 
-from importlib.metadata import version
+from importlib import metadata
 from typing import TYPE_CHECKING, Any
 
 from thesis_repro.errors import InputError, missing_package
@@ -22,15 +22,16 @@ if TYPE_CHECKING:
         OdometrySettings,
         Result,
         Sequence,
-        SequenceLike,
         Step,
+        filled,
+        filtered,
         keypoint_mask,
+        orb,
         refined,
         run,
         run_many,
+        spread,
     )
-    from thesis_repro.odometry import metrics
-    from thesis_repro.odometry.keypoints import filled, filtered, orb, spread
     from thesis_repro.segmentation.unet import build_unet
 
 __all__ = [
@@ -44,13 +45,11 @@ __all__ = [
     "OdometrySettings",
     "Result",
     "Sequence",
-    "SequenceLike",
     "Step",
     "build_unet",
     "filled",
     "filtered",
     "keypoint_mask",
-    "metrics",
     "orb",
     "refined",
     "run",
@@ -63,28 +62,23 @@ if not TYPE_CHECKING:  # a type checker sees the names above, and no others
 
     def __getattr__(name: str) -> Any:
         if name == "__version__":
-            return version("thesis-repro")
-        unknown = AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        if name.startswith("_"):
-            raise unknown
+            return metadata.version("thesis-repro")
+        if name not in __all__:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
         try:
-            if name == "metrics":
-                from thesis_repro.odometry import metrics
+            if name == "build_unet":
+                from thesis_repro.segmentation.unet import build_unet
 
-                return metrics
+                return build_unet
             from thesis_repro import _face
         except ImportError as error:
             missing = missing_package(error)
             if missing is None:
                 raise
-            # not an ImportError, so that help() and hasattr() work without OpenCV
+            # not an ImportError, so that help() and hasattr() work without TensorFlow
             raise AttributeError(f"{name}: {missing}") from None
-        if name in _face.DETECTORS:
-            return _face.DETECTORS[name]
-        if name in __all__:
-            return getattr(_face, name)
-        raise unknown
+        return getattr(_face, name)
 
 
 def __dir__() -> list[str]:
-    return sorted([*__all__, "__version__"])
+    return sorted({*globals(), *__all__, "__version__"})

@@ -1,22 +1,21 @@
-"""The check of the data of a run, before its notebooks: what the Makefile asks for."""
+"""The check of the data of a run, before its notebooks."""
 
-import sys
 from itertools import chain
 from pathlib import Path
 
-from thesis.settings import read_settings
+from thesis.settings import Settings
 from thesis_repro.checks import report
 from thesis_repro.data import cityscapes, kitti
-from thesis_repro.running import files, program
+from thesis_repro.running import files
 
 
-def main(path: Path) -> int:
-    """Check the data that the environment's settings name, unless it was checked before.
+def check(settings: Settings) -> bool:
+    """Check the data of a run, unless it was checked before, and return whether it is sound.
 
-    path: file with the names, sizes and times of the files that were checked; it is written after a
-    check without problems. Returns the exit code. Raises InputError if a file is missing.
+    The names, sizes and times of the files are written beside the results, and again if they have
+    changed: then the notebooks are executed again. Raises InputError if a file is missing.
     """
-    settings = read_settings()
+    path = settings.build / "checked"
     kitti_root = None if settings.kitti_is_embedded else settings.kitti
     cityscapes_root = None if settings.cityscapes_is_embedded else settings.cityscapes
     used: list[Path] = []
@@ -32,12 +31,8 @@ def main(path: Path) -> int:
     lines = [f"{file} {file.stat().st_size} {file.stat().st_mtime_ns}\n" for file in used]
     checked = ascii("".join(lines))  # names may hold any bytes
     if path.is_file() and path.read_text(encoding="utf-8") == checked:
-        return 0
-    if not report(kitti_root, cityscapes_root, settings.kitti_semantic):
-        return 1
-    files.write_text(path, checked)
-    return 0
-
-
-if __name__ == "__main__":
-    program.run_main(lambda: main(Path(sys.argv[1])))
+        return True
+    sound = report(kitti_root, cityscapes_root, settings.kitti_semantic)
+    if sound:
+        files.write_text(path, checked)
+    return sound

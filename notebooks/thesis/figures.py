@@ -8,9 +8,10 @@ import platform
 import subprocess
 import sys
 
-from thesis import page, trainings
+from thesis import checked, page, trainings, used
 from thesis.settings import ROOT, Settings, read_settings
 from thesis_repro.running import program, provenance
+from thesis_repro.running.files import write_text
 
 
 def main() -> int:
@@ -26,6 +27,9 @@ def main() -> int:
             "will differ; FIGURES=/path keeps both"
         )
     with provenance.claimed(settings.build / "notebooks"):
+        if not checked.check(settings):
+            return 1
+        used.record(settings.build)
         status = _execute(settings)
         page.update(settings, settings.published)
     if note := trainings.network_note(settings):
@@ -35,7 +39,9 @@ def main() -> int:
 
 def _execute(settings: Settings) -> int:
     ipython = settings.build / "ipython"
-    ipython.mkdir(exist_ok=True)
+    # what a kernel's compiled code says at its death goes to the log, not into the lost notebook
+    config = "get_config().IPKernelApp.capture_fd_output = False\n"
+    write_text(ipython / "profile_default/ipython_kernel_config.py", config)
     at_once = [] if settings.jobs == 1 else ["-j2"]
     folder = os.path.relpath(settings.build, ROOT)
     command = [os.environ.get("MAKE", "make"), "-k", *at_once, "notebooks", f"RUN={folder}"]

@@ -188,12 +188,23 @@ def profile_name(text: str) -> str:
     return text
 
 
+def folder(text: str) -> Path:
+    """Return the path that a text names; a relative one starts at the checkout."""
+    return ROOT / Path(text).expanduser()
+
+
 def existing_folder(text: str) -> Path:
-    """Return the folder that a text names; a relative one starts at the checkout."""
-    folder = ROOT / Path(text).expanduser()
-    if not folder.is_dir():
+    """Return the path of a folder that must exist."""
+    if not folder(text).is_dir():
         raise ValueError
-    return folder
+    return folder(text)
+
+
+def path_of_letters_digits_and_dashes(text: str) -> Path:
+    """Return a path without what make takes for its own, such as spaces, colons and percent."""
+    if not re.fullmatch(r"[\w/.,+@~-]+", text):
+        raise ValueError
+    return folder(text)
 
 
 DATA = {"KITTI": existing_folder, "CITYSCAPES": existing_folder, "KITTI_SEMANTIC": existing_folder}
@@ -211,8 +222,8 @@ SETTINGS: dict[str, Callable] = (
     | SIZES
     | {
         "PROFILE": profile_name,
-        "BUILD": str,
-        "FIGURES": str,
+        "BUILD": path_of_letters_digits_and_dashes,
+        "FIGURES": folder,
         "JOBS": positive_whole_number,
         "DASK_SCHEDULER": str,
         "PROGRESS": str,  # the file or terminal that progress bars are written to
@@ -238,11 +249,11 @@ def read_settings(environment: Mapping[str, str] | None = None) -> Settings:
     changes = {name.lower(): values[name] for name in SIZES if name in values}
     sizes = replace(PROFILES[profile], **changes)
     run = _run_name(folders, profile, sizes)
-    published = ROOT / values.get("FIGURES", "figures")
+    published = values.get("FIGURES", ROOT / "figures")
     if run != "embedded-demo":
         # figures/ holds the figures of the default run; every other run gets a folder in it
         published /= run
-    build = ROOT / values.get("BUILD", "build")
+    build = values.get("BUILD", ROOT / "build")
     world = build / f"world-{profile}"
     return Settings(
         profile=profile,
