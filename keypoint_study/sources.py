@@ -18,6 +18,7 @@ from thesis_repro.data.trajectories import have_times, read_poses, read_poses_at
 from thesis_repro.errors import InputError, cause
 from thesis_repro.masks import MaskSettings
 from thesis_repro.masks.folders import LabelMasks, MaskFolder, folder_of_sequence, read_mask
+from thesis_repro.odometry import inputs
 from thesis_repro.running import provenance
 from thesis_repro.running.files import images, listed
 
@@ -129,20 +130,7 @@ def _checked_detect(path: Path, detect: Callable) -> Callable:
     """Return a detector that raises InputError for keypoints that are no (u, v) of the frame."""
 
     def checked(frame: np.ndarray, settings: Any, mask: np.ndarray | None = None) -> np.ndarray:
-        points = detect(frame, settings, mask)
-        if _kind(points) != "float32" or points.ndim != 2 or points.shape[1] != 2:
-            raise InputError(
-                f"{path}: detect returned {_described(points)}; must be float32 (N, 2), (u, v) in pixels"
-            )
-        height, width = frame.shape
-        outside = ~((points >= -1) & (points <= [width, height])).all(axis=1)  # also NaN
-        if outside.any():
-            u, v = points[outside.argmax()]
-            raise InputError(
-                f"{path}: detect returned u {u:g}, v {v:g}, outside the frame of {width}x{height} pixels; "
-                "u is the column, v the row"
-            )
-        return points
+        return inputs.keypoints(detect(frame, settings, mask), frame, f"{path}: detect")
 
     return checked
 
@@ -160,7 +148,7 @@ def _checked_track(path: Path, track: Callable) -> Callable:
         is_right = _kind(tracked) in ("float32", "float64") and tracked.shape == points.shape
         if not is_right or _kind(was_found) != "bool" or was_found.shape != points.shape[:1]:
             raise InputError(
-                f"{path}: track returned {_described(tracked)} and {_described(was_found)}; must be "
+                f"{path}: track returned {inputs.described(tracked)} and {inputs.described(was_found)}; must be "
                 f"float32 {points.shape} and bool {points.shape[:1]}, for as many points"
             )
         return tracked.astype(np.float32, copy=False), was_found
@@ -170,13 +158,6 @@ def _checked_track(path: Path, track: Callable) -> Callable:
 
 def _kind(array: Any) -> str:
     return str(getattr(array, "dtype", ""))
-
-
-def _described(array: Any) -> str:
-    """Such as "int64 (500, 2)"."""
-    if isinstance(array, np.ndarray):
-        return f"{array.dtype} {array.shape}"
-    return type(array).__name__
 
 
 def _try(path: Path, sequence: Sequence) -> None:

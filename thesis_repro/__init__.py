@@ -1,11 +1,11 @@
 """A reproduction of a thesis on keypoint masks from segmentation for monocular visual odometry.
 
 The main names: Sequence, keypoint_mask, LabelMasks, Odometry, OdometrySettings, THESIS, run,
-build_unet and InputError. Names are imported on first use, so TensorFlow is loaded only for
-build_unet.
+metrics, build_unet and InputError. Names are imported on first use. Every detector of
+odometry.keypoints.DETECTORS is a name as well. TensorFlow is loaded when build_unet is called.
 """
 
-from importlib import metadata
+from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 from thesis_repro.errors import InputError, missing_package
@@ -22,16 +22,15 @@ if TYPE_CHECKING:
         OdometrySettings,
         Result,
         Sequence,
+        SequenceLike,
         Step,
-        filled,
-        filtered,
         keypoint_mask,
-        orb,
         refined,
         run,
         run_many,
-        spread,
     )
+    from thesis_repro.odometry import metrics
+    from thesis_repro.odometry.keypoints import filled, filtered, orb, spread
     from thesis_repro.segmentation.unet import build_unet
 
 __all__ = [
@@ -45,11 +44,13 @@ __all__ = [
     "OdometrySettings",
     "Result",
     "Sequence",
+    "SequenceLike",
     "Step",
     "build_unet",
     "filled",
     "filtered",
     "keypoint_mask",
+    "metrics",
     "orb",
     "refined",
     "run",
@@ -62,23 +63,28 @@ if not TYPE_CHECKING:  # a type checker sees the names above, and no others
 
     def __getattr__(name: str) -> Any:
         if name == "__version__":
-            return metadata.version("thesis-repro")
-        if name not in __all__:
-            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+            return version("thesis-repro")
+        unknown = AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        if name.startswith("_"):
+            raise unknown
         try:
-            if name == "build_unet":
-                from thesis_repro.segmentation.unet import build_unet
+            if name == "metrics":
+                from thesis_repro.odometry import metrics
 
-                return build_unet
+                return metrics
             from thesis_repro import _face
         except ImportError as error:
             missing = missing_package(error)
             if missing is None:
                 raise
-            # not an ImportError, so that help() and hasattr() work without TensorFlow
+            # not an ImportError, so that help() and hasattr() work without OpenCV
             raise AttributeError(f"{name}: {missing}") from None
-        return getattr(_face, name)
+        if name in _face.DETECTORS:
+            return _face.DETECTORS[name]
+        if name in __all__:
+            return getattr(_face, name)
+        raise unknown
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__, "__version__"})
+    return sorted([*__all__, "__version__"])

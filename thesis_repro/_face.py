@@ -1,8 +1,12 @@
-"""The names of the package but build_unet, which needs TensorFlow."""
+"""The public names of the package, but for `metrics`, which takes half a second to load."""
 
 # ruff: noqa: F401  they are imported for others
 
+from typing import Any
+
 from thesis_repro.data.kitti import Sequence
+from thesis_repro.data.memory import SequenceLike
+from thesis_repro.errors import missing_package
 from thesis_repro.masks import MaskSettings, keypoint_mask
 from thesis_repro.masks.folders import LabelMasks
 from thesis_repro.odometry import (
@@ -17,4 +21,16 @@ from thesis_repro.odometry import (
     run_many,
 )
 from thesis_repro.odometry.estimators import refined
-from thesis_repro.odometry.keypoints import filled, filtered, orb, spread
+from thesis_repro.odometry.keypoints import DETECTORS
+
+
+def build_unet(*arguments: Any, **options: Any) -> Any:
+    """Build the U-Net of appendix A.4; (320, 320, 1), 35 are those of the thesis.
+
+    The arguments are those of thesis_repro.segmentation.unet.build_unet, which needs TensorFlow.
+    """
+    try:
+        from thesis_repro.segmentation import unet
+    except ImportError as error:
+        raise missing_package(error) or error from None
+    return unet.build_unet(*arguments, **options)

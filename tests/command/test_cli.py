@@ -1,6 +1,7 @@
 """The ways in: the command line and the public names."""
 
 import json
+import re
 import shlex
 import subprocess
 import sys
@@ -20,6 +21,7 @@ from thesis_repro.data import cityscapes
 from thesis_repro.data.trajectories import read_poses
 from thesis_repro.masks.kinds import KINDS, Kind
 from thesis_repro.odometry.estimators import COMPARED, ESTIMATORS, Entry
+from thesis_repro.odometry.keypoints import DETECTORS
 from thesis_repro.running import program, provenance
 from thesis_repro.running.files import write_png
 
@@ -46,7 +48,7 @@ def test_the_console_script_prints_the_version():
     "module, name, advice",
     [
         ("cv2", "run", "opencv-python-headless"),
-        ("keras", "build_unet", 'pip install "thesis-repro[segmentation]"'),
+        ("keras", "build_unet((32, 32, 1), 35)", 'pip install "thesis-repro[segmentation]"'),
     ],
 )
 def test_a_missing_package_is_named_in_one_line(module, name, advice):
@@ -55,7 +57,7 @@ def test_a_missing_package_is_named_in_one_line(module, name, advice):
     )
     result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     *_, line = result.stderr.splitlines()
-    assert line.startswith("AttributeError: ") and advice in line
+    assert re.match(r"AttributeError: |thesis_repro.errors.InputError: ", line) and advice in line
 
 
 ODOMETRY = "odometry --kitti kitti --sequence 00"
@@ -187,7 +189,9 @@ def test_without_ground_truth_there_are_no_errors(
 
 @pytest.mark.slow
 def test_public_names():
+    assert dir(tr) == sorted([*tr.__all__, "__version__"])
     assert all(hasattr(tr, name) for name in tr.__all__) and not hasattr(tr, "mistyped")
+    assert {*DETECTORS} <= {*tr.__all__}
     assert tr.__version__ == metadata.version("thesis-repro")
     assert (
         tr.OdometrySettings() == tr.THESIS and tr.Sequence.__module__ == "thesis_repro.data.kitti"
@@ -197,8 +201,8 @@ def test_public_names():
 
 
 def test_tensorflow_is_not_loaded_before_it_is_used():
-    names = "tr.Sequence, tr.keypoint_mask, tr.Odometry, tr.THESIS, tr.run"
-    code = f"import sys, thesis_repro as tr; {names}; assert not {{'tensorflow', 'keras'}} & {{*sys.modules}}"
+    names = "pydoc.render_doc(tr), pydoc.render_doc(tr.Step), tr.build_unet, tr.metrics, tr.run"
+    code = f"import pydoc, sys, thesis_repro as tr; {names}; assert not {{'tensorflow', 'keras'}} & {{*sys.modules}}"
     subprocess.run([sys.executable, "-W", "ignore", "-c", code], check=True)
 
 
@@ -261,6 +265,21 @@ def test_a_new_kind_of_mask_is_one_entry(monkeypatch, tiny_kitti, tmp_path):
     assert run("masks", *where, "--keep", "left", "--output", tmp_path / "masks") == 0
     mask = cv2.imread(str(tmp_path / "masks/000002.png"), cv2.IMREAD_UNCHANGED)
     assert mask[:, : mask.shape[1] // 2].all() and not mask[:, mask.shape[1] // 2 :].any()
+
+
+def test_a_new_detector_is_a_name_and_an_option(tiny_kitti, monkeypatch, capsys):
+    def mine(frame, settings, mask=None):
+        """Seven points, 50 % of which are mine."""
+        return np.full((7, 2), 9, np.float32)
+
+    monkeypatch.setitem(DETECTORS, "mine", mine)
+    assert tr.mine is mine
+    where = ["--kitti", tiny_kitti, "--sequence", "00", "--json"]
+    assert run("odometry", *where, "--detector", "mine") == 0
+    assert json.loads(capsys.readouterr().out)["mean_keypoints"] == 7
+    with pytest.raises(SystemExit):
+        run("odometry", "--help")
+    assert "mine: Seven points, 50 % of which" in " ".join(capsys.readouterr().out.split())
 
 
 def test_a_new_estimator_runs_in_a_study_only_if_it_is_asked_for(monkeypatch):

@@ -21,6 +21,7 @@ from thesis_repro.odometry import (
     THESIS,
     Odometry,
     OdometrySettings,
+    inputs,
     keypoints,
     metrics,
     sharing,
@@ -175,6 +176,57 @@ def test_a_filled_mask_leaves_no_field_empty(drive):
     assert nearest_neighbours(filled).min() >= 3
 
 
+SQUARES = np.array([(67, 117), (157, 57), (257, 67), (407, 107)])  # their centres, (u, v)
+
+
+def assert_on_squares(detector):
+    """Squares of 14 pixels in a wide frame have corners; nothing else has."""
+    frame = np.full((160, 480), 90, np.uint8)
+    for u, v in SQUARES:
+        frame[v - 7 : v + 7, u - 7 : u + 7] = 220
+    points = inputs.keypoints(detector(frame, THESIS, None), frame, "detector")
+    distances = np.abs(points[:, None] - SQUARES).max(axis=2)
+    assert (distances.min(axis=0) < 14).all() and (distances.min(axis=1) < 14).all()
+
+
+@pytest.mark.parametrize("name", [*keypoints.DETECTORS, "shi-tomasi"])
+def test_each_detector_finds_corners_in_columns_and_rows(name):
+    detector = keypoints.DETECTORS.get(name, detect)
+    if isinstance(detector, type):
+        detector = detector(16)
+    assert_on_squares(detector)
+    with pytest.raises((AssertionError, InputError)):
+        assert_on_squares(lambda *arguments: detector(*arguments)[:, ::-1])
+
+
+def test_no_limit_is_none_for_every_detector(drive):
+    for find in (detect, keypoints.orb):
+        assert len(find(drive.frame(0), replace(THESIS, max_keypoints=0))) > 2000
+
+
+def test_keypoints_that_cannot_be_pixels_are_refused(drive):
+    for change, words in {
+        lambda points: points[:, ::-1]: "outside the frame",
+        lambda points: points / np.float32(480): "fractions",
+        lambda points: points * np.float32(np.nan): "u nan",
+        lambda points: points.astype(float): "float64",
+        lambda points: points[:, None]: "float32 .*, 1, 2",
+        lambda points: None: "NoneType",
+    }.items():
+        settings = replace(THESIS, detector=lambda *given: change(detect(*given)))  # noqa: B023
+        with pytest.raises(InputError, match=f"frame 0: .*{words}"):
+            odometry.run(drive, settings)
+
+
+@pytest.mark.parametrize("order, warns", [(slice(None), False), (slice(None, None, -1), True)])
+def test_keypoints_that_are_most_likely_swapped_are_warned_of(order, warns, caplog):
+    """In a square frame, nothing is certain."""
+    frame = np.full((160, 160), 90, np.uint8)
+    frame[10:60:9, 60:150:9] = 220
+    inputs.keypoints(detect(frame)[:, order], frame, "detector", is_first=True)
+    assert ("swapped" in caplog.text) == warns
+
+
 # Bad frames are flagged, and the run goes on
 
 
@@ -313,6 +365,16 @@ def test_own_functions_take_the_places_of_opencvs_calls(drive):
     assert metrics.rmse(result.poses[:3], few.poses[:3]) < 0.05
 
 
+@pytest.mark.parametrize("number", [200, 100])
+def test_the_detector_of_the_settings_holds_unless_detect_is_replaced(drive, number):
+    few, settings = Changed(drive, frames=3), replace(THESIS, detector=keypoints.spread(200))
+    calls = OPENCV._replace(track=lambda *given: OPENCV.track(*given))
+    if number == 100:
+        calls = calls._replace(detect=keypoints.spread(100))
+    result = odometry.run(few, settings, calls=calls)
+    assert (result.frames["detected"] == number).all()
+
+
 class LeastMedian(VoteOfAll):
     """An estimator that brings its own search."""
 
@@ -347,6 +409,28 @@ def test_settings_are_equal_elsewhere_and_so_is_their_record():
     assert record["estimator"] == "thesis_repro.odometry.estimators.refined"
     with pytest.raises(InputError, match="number of keypoints"):
         keypoints.spread(0)
+
+
+@pytest.mark.parametrize("estimator", [None, refined])
+def test_a_kept_step_has_the_matrix_that_its_matches_agree_with(drive, estimator):
+    few, settings = Changed(drive, frames=4), replace(THESIS, estimator=estimator)
+    plain, kept = odometry.run(few, settings), odometry.run(few, settings, keep_steps=True)
+    np.testing.assert_array_equal(kept.poses, plain.poses)
+    assert len(plain.steps) == 0 and len(kept.steps) == 4 and kept.steps[0].essential is None
+    step = kept.steps[2]
+    np.testing.assert_array_equal(step.keypoints, detect(few.frame(2)))
+    assert {*map(tuple, step.previous)} <= {*map(tuple, kept.steps[1].keypoints)}
+    previous, current = (
+        np.c_[side, np.ones(len(side))][step.inliers]
+        for side in (step.matches.previous, step.matches.current)
+    )
+    residual = np.abs((previous @ step.essential * current).sum(axis=1)).mean()
+    transposed = np.abs((current @ step.essential * previous).sum(axis=1)).mean()
+    assert residual < 1e-3 and transposed > 5 * residual
+    rebuilt = np.cross(np.eye(3), step.motion.translation).T @ step.motion.rotation
+    expected, given = (matrix / np.linalg.norm(matrix) for matrix in (rebuilt, step.essential))
+    difference = min(np.abs(expected - given).max(), np.abs(expected + given).max())
+    assert (difference < 1e-9) == (estimator is None) and difference < 0.1
 
 
 def test_shuffled_points_change_the_path_and_repeat_with_the_seed(drive):
@@ -489,6 +573,7 @@ def test_runs_share_no_keypoints_if_a_setting_differs_that_may_matter(
     [
         ("estimator", "best"),
         ("detector", "fast"),
+        ("detector", keypoints.spread),
         ("max_keypoints", -1),
         ("threshold", 0.0),
     ],
@@ -507,7 +592,7 @@ def test_wrong_frames_and_masks_are_named_and_leave_the_state(drive):
         (frame[:80], 0.4),
         (frame / 255, 0.4),
         (frame, float("nan")),
-        (frame, None),
+        (frame,),
         (frame, Fraction(-1, 2)),
         (None, 0.4),  # of cv2.imread, for a missing file
         (frame, 0.4, frame.tolist()),

@@ -285,10 +285,9 @@ def _text(record: dict[str, Any], sequence: Any, speed: float | None) -> str:
 
 def _detector(options: Any) -> Any:
     """The detector that --detector, --spread and --fill choose; None for the thesis's."""
-    from thesis_repro.odometry.estimators import DETECTORS
-    from thesis_repro.odometry.keypoints import filled, spread
+    from thesis_repro.odometry.keypoints import DETECTORS, filled, spread
 
-    detector = DETECTORS[vars(options).get("detector", "shi-tomasi")]
+    detector = DETECTORS.get(vars(options).get("detector"))  # none for the thesis's
     if options.spread:
         if detector or vars(options).get("max_keypoints", 2000) != 2000:
             raise InputError("--spread N: goes without --max-keypoints and --detector")

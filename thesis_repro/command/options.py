@@ -50,12 +50,17 @@ def _keep() -> dict[str, Any]:
 
 
 def _detector() -> dict[str, Any]:
-    from thesis_repro.odometry.estimators import DETECTORS
+    from thesis_repro.odometry.keypoints import DETECTORS
 
+    detectors = {
+        name: f"{name}: {detector.__doc__}".splitlines()[0].rstrip(".").replace("%", "%%")
+        for name, detector in DETECTORS.items()
+        if not isinstance(detector, type)  # it needs a number
+    }
     return dict(
-        choices=list(DETECTORS),
+        choices=["shi-tomasi", *detectors],
         default="shi-tomasi",
-        help="keypoint detector; the tracker stays the same (shi-tomasi)",
+        help=f"what finds keypoints: {'; '.join(detectors.values())} (shi-tomasi)",
     )
 
 

@@ -1,9 +1,7 @@
 """What stands for a sequence, and a sequence whose frames are in memory."""
 
 import hashlib
-import operator
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
@@ -75,17 +73,12 @@ class ArraySequence:
             raise InputError("scales, poses, speed: give one of them, for the lengths of steps")
         if speed is not None and times is None:
             raise InputError("speed: needs the times of the frames, in seconds")
-        count = len(frames)
         self._frames, self.intrinsics = frames, np.array(intrinsics, float)
-        self.times = FRAME_TIME * np.arange(count)
-        if times is not None:
-            self.times = _numbers("times", times, (count,))
-        self.scales = step_lengths(self.times, speed)
-        if scales is not None:
-            self.scales = _numbers("scales", scales, (count,))
+        self.times = _numbers("times", times, FRAME_TIME * np.arange(len(frames)))
+        self.scales = _numbers("scales", scales, step_lengths(self.times, speed))
         self.has_truth = poses is not None
         if self.has_truth:
-            self._poses = _numbers("poses", poses, (count, 4, 4))
+            self._poses = _numbers("poses", poses, np.empty((len(frames), 4, 4)))
             if not are_poses(self._poses).all():
                 raise InputError("poses: must be camera to world, a rotation and a position each")
             self.scales = distances(self._poses)
@@ -94,13 +87,8 @@ class ArraySequence:
     def poses(self) -> np.ndarray:
         """True camera-to-world poses, (n, 4, 4), metres. Raises InputError if there are none."""
         if not self.has_truth:
-            raise InputError(f"{self.name}: no poses were given; ground truth is needed")
+            raise InputError("poses: none were given for the frames, but ground truth is needed")
         return self._poses
-
-    @property
-    def frame_paths(self) -> list[Path]:
-        """There are no files. Raises InputError, so that no folder of masks is looked for."""
-        raise InputError(f"{self.name}: have no files; give their masks as a list, one a frame")
 
     @property
     def size(self) -> tuple[int, ...]:
@@ -115,7 +103,7 @@ class ArraySequence:
         return np.array(self._frames[index])
 
     def __getitem__(self, index: int) -> np.ndarray:
-        return self.frame(operator.index(index))
+        return self.frame(index)
 
     def __iter__(self) -> Iterator[np.ndarray]:
         return map(self.frame, range(len(self)))
@@ -150,8 +138,11 @@ def step_lengths(times: np.ndarray, speed: float | None) -> np.ndarray:
     return np.array([0.0, *lengths])
 
 
-def _numbers(name: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
+def _numbers(name: str, values: Any, default: np.ndarray) -> np.ndarray:
+    """Return finite numbers of the default's shape, or the default for None."""
+    if values is None:
+        return default
     array = np.array(values, float)
-    if array.shape != shape or not np.isfinite(array).all():
-        raise InputError(f"{name}: must be finite numbers of shape {shape}, not of {array.shape}")
+    if array.shape != default.shape or not np.isfinite(array).all():
+        raise InputError(f"{name}: {array.shape}; must be finite numbers, {default.shape}")
     return array

@@ -193,17 +193,18 @@ def _paths_by_frame(folder: str | Path, sequence: Sequence, kind: str) -> list[P
     """One path a frame to its mask or label map. Raises InputError if one is missing."""
     if kind == "mask" and Path(folder).is_file():
         return [Path(folder)] * len(sequence)
+    if not hasattr(sequence, "frame_paths"):
+        raise InputError(
+            f"{folder}: the frames are not in files, so no {kind} belongs to them; give masks as a "
+            "list, one a frame"
+        )
     if sequence.distortion.any():
         raise InputError(
             f"{folder}: {kind}s of raw frames do not fit frames without distortion; undistort the frames "
             "before their label maps are made, and leave out --calibration"
         )
-    if kind == "mask" and not _images_by_name(Path(folder)):
-        others = {path.suffix for path in listed(folder, "*") if path.is_file()}
-        if others:
-            raise InputError(
-                f"{folder}: holds {', '.join(sorted(others))}; masks are PNG or JPEG images, one for each frame"
-            )
+    if kind == "mask":
+        _check_format(Path(folder))
     folder = folder_of_sequence(folder, sequence.name)
     if not folder.is_dir():
         raise InputError(
@@ -229,6 +230,16 @@ def _paths_by_frame(folder: str | Path, sequence: Sequence, kind: str) -> list[P
             f"{sequence.name} have none); each frame needs one"
         )
     return [present[name] for name in sequence.label_names]
+
+
+def _check_format(folder: Path) -> None:
+    """Raise InputError for a folder with files, none of which is an image."""
+    endings = {path.suffix for path in listed(folder, "*") if path.is_file()}
+    if endings and not _images_by_name(folder):
+        raise InputError(
+            f"{folder}: holds {', '.join(sorted(endings))}; masks are PNG or JPEG images, one for "
+            "each frame"
+        )
 
 
 def _images_by_name(folder: Path) -> dict[str, Path]:

@@ -1,4 +1,4 @@
-"""The names of estimators and detectors, in tables and on the command line.
+"""The names of estimators, in tables and on the command line.
 
 Settings take the objects: OdometrySettings(estimator=refined). A new estimator is a class with a
 method `motion` and, if it wants no RANSAC, its own `search` (step.Estimator), and an entry here.
@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from thesis_repro.odometry import keypoints
 from thesis_repro.odometry.loop import VoteOfAll
 from thesis_repro.odometry.step import Estimator, Matches, Motion
 
@@ -45,4 +44,3 @@ ESTIMATORS = {
     "refined": Entry("refined estimator", refined),
 }
 COMPARED = ("thesis", "refined")  # those of every study that names no others
-DETECTORS: dict[str, Callable | None] = {"shi-tomasi": None, "orb": keypoints.orb}

@@ -2,12 +2,17 @@
 
 from typing import Any
 
+import cv2
 import numpy as np
 
 from thesis_repro.data.geometry import are_poses, check_camera, is_camera_matrix
 from thesis_repro.errors import InputError
+from thesis_repro.odometry.settings import THESIS
+from thesis_repro.running import program
 
 MIN_CONTRAST = 4.0  # standard deviation in gray levels; real frames have more than 50
+MANY = 20  # keypoints from which on they tell what their coordinates are
+WEAKER = 2  # times, in the mean, are corners stronger where swapped coordinates are
 EQUAL = "equal frame"  # flag of a frame that equals the one before
 
 
@@ -65,6 +70,13 @@ def reasons_to_skip(frame: np.ndarray, previous: np.ndarray | None) -> list[str]
 
 def step_length(scale: Any, number: int) -> float:
     """Return the length of the step to frame `number`, metres, or raise InputError."""
+    if scale is None:
+        if number == 0:
+            return 0.0
+        raise InputError(
+            f"frame {number}: step(frame, scale) needs the metres moved since the frame before, which "
+            "one camera cannot measure; 1.0 for steps of equal length"
+        )
     try:
         metres = float(scale)
     except (TypeError, ValueError):
@@ -92,3 +104,52 @@ def allowed_pixels(mask: Any, number: int, frame: np.ndarray) -> np.ndarray | No
             "0 and 255 (keypoint_mask makes masks from label maps)"
         )
     return mask
+
+
+def keypoints(points: Any, frame: np.ndarray, detector: str, is_first: bool = False) -> np.ndarray:
+    """Return keypoints of a frame, float32 (N, 2), or raise InputError.
+
+    What lies outside of the frame cannot be (u, v). In the first frame, a warning says what is most
+    likely (v, u). detector: the name of what found them, for the messages.
+    """
+    returned = f"{detector} returned"
+    if getattr(points, "dtype", None) != np.float32 or np.shape(points)[1:] != (2,):
+        raise InputError(
+            f"{returned} {described(points)}; must be float32 (N, 2), (u, v) in pixels"
+        )
+    height, width = frame.shape
+    outside = ~((points >= -1) & (points <= [width, height])).all(axis=1)  # also NaN
+    if outside.any():
+        u, v = points[outside.argmax()]
+        raise InputError(
+            f"{returned} u {u:g}, v {v:g}, outside the frame of {width}x{height} pixels; u is the "
+            "column, v the row"
+        )
+    if len(points) >= MANY and points.max() <= 1:
+        raise InputError(f"{returned} fractions from 0 to 1; must be (u, v) in pixels")
+    if is_first and _may_be_swapped(points, frame):
+        program.log.warning(
+            f"{returned} keypoints on much weaker corners than with u and v swapped; u is the column, v "
+            "the row"
+        )
+    return points
+
+
+def described(value: Any) -> str:
+    """Return the kind of an array, such as "int64 (500, 2)", or the type of something else."""
+    if isinstance(value, np.ndarray):
+        return f"{value.dtype} {value.shape}"
+    return type(value).__name__
+
+
+def _may_be_swapped(points: np.ndarray, frame: np.ndarray) -> bool:
+    """Whether keypoints (N, 2) lie on much weaker corners than with both coordinates swapped.
+
+    Only those can be compared that are inside the frame in both orders.
+    """
+    both = points[(points.max(axis=1) < min(frame.shape) - 1) & (points.min(axis=1) >= 0)]
+    if len(both) < MANY:
+        return False
+    columns, rows = np.rint(both).astype(int).T
+    strength = cv2.cornerMinEigenVal(frame, THESIS.block_size)
+    return bool(strength[columns, rows].mean() > WEAKER * strength[rows, columns].mean())

@@ -1,5 +1,7 @@
 """Detectors beside the thesis's, for settings: OdometrySettings(detector=spread(200)).
 
+A new one is a function or class here and its name in DETECTORS.
+
 A detector is a function of a frame (height, width), settings and a mask, (height, width) or None,
 which allows keypoints where it is not 0. It returns (N, 2) float32 pixels, strongest first. Those
 with a number are small objects, equal if their numbers are. They are quicker on a frame that nobody
@@ -9,7 +11,6 @@ which most runs do without.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import cv2
 import numpy as np
@@ -22,8 +23,9 @@ FIELDS = (5, 16)  # rows and columns into which a frame is divided to fill a mas
 def orb(
     frame: np.ndarray, settings: OdometrySettings = THESIS, mask: np.ndarray | None = None
 ) -> np.ndarray:
-    """Find max_keypoints of ORB. They are still tracked by Lucas-Kanade."""
-    points = cv2.KeyPoint_convert(cv2.ORB_create(settings.max_keypoints).detect(frame, mask))
+    """ORB's keypoints, still tracked by Lucas-Kanade."""
+    number = settings.max_keypoints or frame.size  # ORB takes 0 for none
+    points = cv2.KeyPoint_convert(cv2.ORB_create(number).detect(frame, mask))
     return np.reshape(points, (-1, 2)).astype(np.float32, copy=False)
 
 
@@ -108,7 +110,7 @@ class filled:
 def filtered(
     frame: np.ndarray, settings: OdometrySettings = THESIS, mask: np.ndarray | None = None
 ) -> np.ndarray:
-    """Find the thesis's keypoints in the whole frame, and drop those outside the mask."""
+    """The thesis's keypoints of the whole frame, without those outside the mask."""
     from thesis_repro.odometry import corners
 
     points = corners.detect(frame, settings)
@@ -118,13 +120,14 @@ def filtered(
     return points[mask[rows, columns] > 0]
 
 
-def _corners() -> Any:
-    from thesis_repro.odometry import corners  # loads the compiler, which most runs do without
-
-    return corners
-
-
 def _fields(points: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
     """Number of the field in which each of N points (N, 2) lies, (N,)."""
     columns, rows = (points // (size[1] / FIELDS[1], size[0] / FIELDS[0])).astype(int).T
     return rows * FIELDS[1] + columns
+
+
+# {name: detector}. Each is thesis_repro.NAME and, unless it needs a number, --detector NAME, which
+# the first line of its docstring explains.
+DETECTORS: dict[str, Callable] = {
+    detector.__name__: detector for detector in (orb, filtered, spread, filled)
+}

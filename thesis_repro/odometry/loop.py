@@ -144,13 +144,16 @@ class Odometry:
         """Start before the first frame.
 
         intrinsics: 3x3, pixels, as (fx, 0, u), (0, fy, v), (0, 0, 1). start: pose of the first
-        frame, 4x4; None for the identity. calls: functions in place of OpenCV's.
+        frame, 4x4; None for the identity. calls: functions in place of OpenCV's. The settings'
+        detector holds unless `detect` is among them.
         Raises InputError for another matrix, and for a start that is no pose.
         """
         need("settings", settings, OdometrySettings)
         self.intrinsics = inputs.camera_matrix(intrinsics)
         self.settings = settings
-        self.calls = calls or OPENCV._replace(detect=settings.detector or detect)
+        self.calls = calls or OPENCV
+        if settings.detector and self.calls.detect is detect:
+            self.calls = self.calls._replace(detect=settings.detector)
         self.estimator: Estimator = (settings.estimator or VoteOfAll)(self.calls)
         self.pose = inputs.start_pose(start)
         self.count = 0  # of frames so far
@@ -158,12 +161,13 @@ class Odometry:
         self.points = NO_POINTS  # in it
         self.metres = 0.0  # moved since then
 
-    def step(self, frame: Any, scale: Any = 0.0, mask: Any = None) -> Step:
+    def step(self, frame: Any, scale: Any = None, mask: Any = None) -> Step:
         """Take the next frame. Returns a Step.
 
-        frame: (height, width) uint8. scale: metres moved since the frame before. mask: of the same
-        size, uint8 or bool; keypoints lie only where it is not 0.
-        Raises InputError for a frame, scale or mask of another kind.
+        frame: (height, width) uint8. scale: metres moved since the frame before; only the first
+        frame needs none. mask: of the same size, uint8 or bool; keypoints lie only where it is not
+        0.
+        Raises InputError for a frame, scale, mask or keypoints of another kind.
         """
         frame = inputs.gray_frame(frame, self.count, self.intrinsics, self.previous)
         mask = inputs.allowed_pixels(mask, self.count, frame)
@@ -209,6 +213,7 @@ class Odometry:
         if matrix.shape != (3, 3):  # from five matches, OpenCV returns all solutions in one array
             step.flags.append("several essential matrices")
             return
+        step.essential = matrix
         agrees = np.empty(len(current), bool)
         agrees[order] = inliers.ravel() > 0
         step.matches = Matches(current, previous, threshold, agrees, order)
@@ -239,7 +244,9 @@ class Odometry:
         points = step.current
         if len(points) < self.settings.redetect_below or not len(points):
             with step.timed("detect"):
-                detected = self.calls.detect(frame, self.settings, mask)
+                found = self.calls.detect(frame, self.settings, mask)
+            name = f"frame {step.frame}: the detector"
+            detected = inputs.keypoints(found, frame, name, step.frame == 0)
             step.detected = len(detected)
             if len(detected):
                 points = detected

@@ -82,29 +82,26 @@ def ate(estimated: np.ndarray, true: np.ndarray, alignment: str = "none") -> flo
 RELATIVE_LENGTH = 20.0  # metres; even the short excerpts have several segments of this length
 
 
-def relative_errors(
-    estimated: np.ndarray, true: np.ndarray, length: float = RELATIVE_LENGTH
-) -> dict[str, float]:
-    """Mean errors over segments of one length.
+def relative_errors(estimated: np.ndarray, true: np.ndarray) -> dict[str, float]:
+    """Mean errors over segments of RELATIVE_LENGTH.
 
     Returns {translation_percent, rotation_deg_per_100m}. These are not the errors of the KITTI
     benchmark (`kitti_errors`). A segment goes from each frame to the first frame that
-    is `length` metres of true path away. Each estimated motion M is rotated to B M B^T and compared
+    is so many metres of true path away. Each estimated motion M is rotated to B M B^T and compared
     with the true motion. The rotation B is common to all segments and fits best: Kabsch's solution
     for the translations and rotation vectors. So neither a constant rotation between camera and
     ground truth nor the start of the path changes the errors. (The KITTI benchmark's errors contain
-    that rotation.) The errors are NaN if the path is shorter than `length`.
+    that rotation.) The errors are NaN if the path is shorter.
     """
     estimated, true = _as_paths(estimated, true)
     along = travelled(true)
-    last = np.searchsorted(along, along + length)
+    last = np.searchsorted(along, along + RELATIVE_LENGTH)
     first = np.flatnonzero(last < len(true))
     if not len(first):
         return {"translation_percent": np.nan, "rotation_deg_per_100m": np.nan}
     motion = _motions(estimated, first, last[first])
     true_motion = _motions(true, first, last[first])
-    vectors = _motion_vectors(motion, length)
-    true_vectors = _motion_vectors(true_motion, length)
+    vectors, true_vectors = _motion_vectors(motion), _motion_vectors(true_motion)
     moments = true_vectors.T @ vectors
     # The small multiple of the identity keeps a rotation zero that a straight path does not
     # determine.
@@ -115,18 +112,18 @@ def relative_errors(
     differences = true_motion[:, :3, :3].swapaxes(1, 2) @ turn @ motion[:, :3, :3] @ turn.T
     angle = np.linalg.norm(Rotation.from_matrix(differences).as_rotvec(), axis=1)
     return {
-        "translation_percent": float(offsets.mean() / length * 100),
-        "rotation_deg_per_100m": float(np.degrees(angle.mean()) / length * 100),
+        "translation_percent": float(offsets.mean() / RELATIVE_LENGTH * 100),
+        "rotation_deg_per_100m": float(np.degrees(angle.mean()) / RELATIVE_LENGTH * 100),
     }
 
 
-def _motion_vectors(motions: np.ndarray, length: float) -> np.ndarray:
+def _motion_vectors(motions: np.ndarray) -> np.ndarray:
     """Translations and rotation vectors (2 n, 3) of motions (n, 4, 4).
 
-    The rotation vectors, radians, are multiplied by a length, metres, so that both weigh alike.
+    The rotation vectors, radians, are multiplied by RELATIVE_LENGTH, so that both weigh alike.
     """
     rotations = Rotation.from_matrix(motions[:, :3, :3]).as_rotvec()
-    return np.concatenate([motions[:, :3, 3], length * rotations])
+    return np.concatenate([motions[:, :3, 3], RELATIVE_LENGTH * rotations])
 
 
 def errors(estimated: np.ndarray, true: np.ndarray) -> dict[str, float]:

@@ -1,24 +1,25 @@
 """Run the odometry over a sequence: one run, or many runs in one pass, which share their work."""
 
 import time
-from collections.abc import Mapping, Sized
+from collections.abc import Mapping, Sequence, Sized
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import pandas as pd
 
-from thesis_repro.data.kitti import Sequence
+from thesis_repro.data.memory import SequenceLike
 from thesis_repro.errors import InputError
 from thesis_repro.odometry.inputs import EQUAL
-from thesis_repro.odometry.loop import STATIONARY, Calls, Odometry, detect
+from thesis_repro.odometry.loop import STATIONARY, Calls, Odometry
 from thesis_repro.odometry.settings import THESIS, OdometrySettings
-from thesis_repro.odometry.step import FRAME_COLUMNS, ROTATION_COLUMNS, TIMED_PARTS
+from thesis_repro.odometry.step import FRAME_COLUMNS, ROTATION_COLUMNS, TIMED_PARTS, Step
 from thesis_repro.running.files import progress
 
 # Frames from which faster calls with OpenCV's bits pay. To load them takes 2 s, to compile 25 s;
 # each frame then takes 10 ms less.
 FRAMES_TO_LOAD, FRAMES_TO_COMPILE = 250, 2500
+NEEDED = ("intrinsics", "scales", "has_truth", "frame", "visible", "__len__")  # of a sequence
 COUNTS = ("points", "detected", "tracked", "inliers", "pose_inliers")  # blank where there is none
 
 
@@ -36,13 +37,15 @@ class Masks(Protocol):
 class Result:
     """Result of one run.
 
-    poses: (n, 4, 4) camera to world, metres. frames: one row a frame, see Step.row; missing values
-    are blank. A result equals only itself; compare poses with np.array_equal.
+    poses: estimated path, (n, 4, 4), camera to world, metres. frames: a table with one row a frame,
+    see Step.row; missing values are blank. steps: of `run(..., keep_steps=True)`, one Step a frame.
+    A result equals only itself; compare poses with np.array_equal.
     """
 
     poses: np.ndarray
     frames: pd.DataFrame
     settings: OdometrySettings = THESIS
+    steps: Sequence[Step] = ()
 
     @property
     def flagged(self) -> pd.Series:
@@ -67,7 +70,7 @@ def is_flagged(frames: pd.DataFrame) -> pd.Series:
     return ~frames["flag"].isin(["", STATIONARY, EQUAL])
 
 
-def start_pose(sequence: Sequence) -> np.ndarray:
+def start_pose(sequence: SequenceLike) -> np.ndarray:
     """First pose of the estimate.
 
     It is the identity, as in PySLAM, unless the ground truth starts at another pose. Complete KITTI
@@ -79,34 +82,38 @@ def start_pose(sequence: Sequence) -> np.ndarray:
 
 
 def run(
-    sequence: Sequence,
+    sequence: SequenceLike,
     settings: OdometrySettings = THESIS,
     masks: Masks | None = None,
     description: str | None = None,
     calls: Calls | None = None,
+    keep_steps: bool = False,
 ) -> Result:
-    """Run the odometry over a kitti.Sequence. Returns a Result.
+    """Run the odometry over a sequence. Returns a Result.
 
     masks: see Masks. description: text of the progress bar; None for no bar. calls: functions in
     place of OpenCV's, see loop.Calls. Without them, a long run takes faster ones with the same
-    bits.
+    bits. keep_steps: keep each Step, with its keypoints and matches, in Result.steps; without
+    masks, about 150 kB a frame.
     Raises InputError if a frame cannot be read, if a mask and its frame differ in size, if there
     are fewer masks than frames, and for another kind of sequence, settings or masks.
     """
     check(sequence, masks)
-    calls = calls or _faster_calls(len(sequence), settings)
+    calls = calls or _faster_calls(len(sequence))
     odometry = Odometry(sequence.intrinsics, settings, start_pose(sequence), calls)
     step_lengths = sequence.scales
-    rows = []
+    rows, steps = [], []
     for index in progress(range(len(sequence)), description):
         frame = sequence.frame(index)
         mask, mask_seconds = _masks_of_frame(sequence, index, [masks])[id(masks)]
         step = odometry.step(frame, step_lengths[index], mask)
         rows.append([*step.row().values(), mask_seconds])
-    return _result(rows, settings)
+        if keep_steps:
+            steps.append(step)
+    return _result(rows, settings, steps)
 
 
-def _faster_calls(frames: int, settings: OdometrySettings) -> Calls | None:
+def _faster_calls(frames: int) -> Calls | None:
     """Return faster calls with the bits of OpenCV's if they pay in a run of so many frames."""
     if frames < FRAMES_TO_LOAD:
         return None
@@ -116,11 +123,11 @@ def _faster_calls(frames: int, settings: OdometrySettings) -> Calls | None:
     if frames < FRAMES_TO_COMPILE and not opencv_exact.is_compiled():
         return None
     search, vote = opencv_exact.find_essential_matrix, opencv_exact.recover_pose
-    return Calls(settings.detector or detect, sharing.track, search, vote)
+    return Calls(track=sharing.track, find_essential_matrix=search, recover_pose=vote)
 
 
 def run_many(
-    sequence: Sequence,
+    sequence: SequenceLike,
     runs: Mapping[Any, tuple[OdometrySettings, Masks | None]],
     description: str | None = None,
 ) -> dict[Any, Result]:
@@ -156,7 +163,7 @@ def run_many(
 
 
 def _masks_of_frame(
-    sequence: Sequence, index: int, masks_of_runs: list[Masks | None]
+    sequence: SequenceLike, index: int, masks_of_runs: list[Masks | None]
 ) -> dict[int, tuple[np.ndarray | None, float]]:
     """The mask of a frame and the seconds to make it, by the identity of the masks object."""
     visible, made = sequence.visible(index), {}
@@ -180,19 +187,21 @@ def inside(visible: np.ndarray | None, mask: Any) -> Any:
 
 def check(sequence: Any, masks: Any) -> None:
     """Raise InputError unless a sequence is one, and its masks are enough masks or None."""
-    if not hasattr(sequence, "frame"):
+    missing = [name for name in NEEDED if name not in dir(sequence)]
+    if missing:
         raise InputError(
-            f"sequence: must be a thesis_repro.Sequence, not {type(sequence).__name__}"
+            f"sequence: must be a thesis_repro.Sequence, not {type(sequence).__name__}, which lacks "
+            f"{', '.join(missing)} (see thesis_repro.SequenceLike)"
         )
     is_short = isinstance(masks, Sized) and len(masks) < len(sequence)
     if is_short or not isinstance(masks, Masks | None):
         raise InputError(f"masks: must be {len(sequence)} masks, one a frame, such as LabelMasks")
 
 
-def _result(rows: list[list], settings: OdometrySettings) -> Result:
+def _result(rows: list[list], settings: OdometrySettings, steps: Sequence[Step] = ()) -> Result:
     frames = pd.DataFrame(rows, columns=[*FRAME_COLUMNS, "mask_seconds"])
     frames = frames.astype(dict.fromkeys(COUNTS, "Int64"))
-    return Result(poses_of(frames), frames, settings)
+    return Result(poses_of(frames), frames, settings, steps)
 
 
 def poses_of(frames: pd.DataFrame) -> np.ndarray:

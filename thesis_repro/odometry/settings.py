@@ -42,7 +42,7 @@ class OdometrySettings:
     """Settings of the odometry. The defaults are the thesis's.
 
     detector: finds the keypoints of a frame. None: the strongest Shi-Tomasi corners, as in the
-    thesis. Others are in `keypoints`: spread(200), filled(5), filtered, orb.
+    thesis. Others are in `keypoints.DETECTORS`: spread(200), filled(5), filtered, orb.
     estimator: how the motion follows from the essential matrix, which allows four motions. None:
     all points vote for one of the four, as in PySLAM. Others are in `estimators`. With
     VoteOfInliers only the inliers vote (audit rows 13, 29). With `refined` the smaller of the two
@@ -100,6 +100,11 @@ class OdometrySettings:
                     f"odometry setting {name}: {value!r} is not a function or object, such as "
                     f"thesis_repro.{example}"
                 )
+        if isinstance(self.detector, type):
+            raise InputError(
+                f"odometry setting detector: {self.detector.__name__} needs its number, as in "
+                f"thesis_repro.{self.detector.__name__}(200)"
+            )
         for field in fields(self):
             if field.name in LIMITS:
                 check_number(field.name, getattr(self, field.name), field.type)

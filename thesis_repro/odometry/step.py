@@ -69,10 +69,23 @@ class Estimator(Protocol):
 
 @dataclass(eq=False)
 class Step:
-    """Results for one frame.
+    """What one step of the odometry found, from the previous frame to this one.
 
-    Its N matched points are `previous` and `current`, (N, 2) pixels, and `matches`, the same in
-    normalised coordinates. Later steps do not depend on its arrays.
+    keypoints: of this frame, (M, 2), (u, v) in pixels; they are tracked into the next one.
+    previous, current: the N matches of this step, (N, 2) pixels: keypoints of the previous frame,
+    and where they are in this one. matches: the same in normalised coordinates, x = K^-1 (u, v, 1).
+    inliers: matches that agree with the essential matrix, (N,) booleans.
+    essential: the essential matrix, (3, 3), or None. With x of the normalised coordinates,
+    x_previous^T E x_current = 0, because PySLAM gives OpenCV the current points first. (Called as
+    usual, OpenCV would return the transpose.)
+    motion: rotation R and translation t of length 1, from this camera to the previous one:
+    x_previous ~ R x_current + t / depth. Under the thesis's estimator, E is [t]x R times a number,
+    because R and t are taken from E. The refined estimator fits them anew, so they differ from E.
+    pose: camera to world, (4, 4), metres; the previous pose times (R, scale t), if `updated`.
+    points, detected: numbers of points to track, and of new keypoints.
+
+    "The previous frame" is the last one that was not skipped. The first frame has keypoints only.
+    Later steps do not depend on these arrays.
     """
 
     frame: int
@@ -82,6 +95,7 @@ class Step:
     previous: np.ndarray = field(default_factory=lambda: NO_POINTS)
     current: np.ndarray = field(default_factory=lambda: NO_POINTS)
     matches: Matches | None = None
+    essential: np.ndarray | None = None
     keypoints: np.ndarray = field(default_factory=lambda: NO_POINTS)  # tracked into the next frame
     motion: Motion = Motion()
     pose: np.ndarray = field(default_factory=lambda: np.eye(4))  # camera to world, metres

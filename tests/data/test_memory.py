@@ -1,0 +1,80 @@
+"""Frames in memory stand for a sequence, with the same bits."""
+
+import numpy as np
+import pytest
+from street import Street
+
+import thesis_repro as tr
+from thesis_repro.errors import InputError
+
+
+@pytest.fixture(scope="module")
+def street():
+    return Street(6)
+
+
+def drive(street, **lengths):
+    return tr.Sequence.from_arrays(street.images, street.intrinsics, **lengths)
+
+
+def test_arrays_give_the_bits_of_a_sequence(street):
+    expected = tr.run(street).poses
+    stack = np.array(street.images)
+    whole = tr.Sequence.from_arrays(stack, street.intrinsics.tolist(), poses=street.poses)
+    np.testing.assert_array_equal(tr.run(whole).poses, expected)
+    np.testing.assert_array_equal(tr.run_many(whole, {"": (tr.THESIS, None)})[""].poses, expected)
+    assert stack.flags.writeable and whole.size == street.size
+    np.testing.assert_array_equal(whole[-1], street.images[-1])
+    assert [frame.sum() for frame in whole] == [image.sum() for image in street.images]
+
+
+@pytest.mark.parametrize(
+    "lengths, expected",
+    [
+        ({}, [0, 1, 1, 1, 1, 1]),
+        ({"scales": range(6)}, [0, 1, 2, 3, 4, 5]),
+        ({"speed": 5, "times": [0, 1, 2, 4, 5, 6]}, [0, 5, 5, 10, 5, 5]),
+    ],
+)
+def test_steps_have_the_lengths_that_were_given(street, lengths, expected):
+    result = tr.run(drive(street, **lengths))
+    np.testing.assert_array_equal(result.frames["scale"], expected)
+    np.testing.assert_array_equal(result.poses[0], np.eye(4))
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"frames": []},
+        {"frames": iter([1])},
+        {"scales": [1, 2]},
+        {"scales": [np.nan] * 6},
+        {"scales": [1] * 6, "speed": 3},
+        {"speed": 3},
+        {"poses": np.ones((6, 4, 4))},
+        {"poses": np.eye(4)},
+        {"times": [1]},
+    ],
+)
+def test_wrong_arrays_are_named(street, wrong):
+    given = {"frames": street.images, "intrinsics": street.intrinsics} | wrong
+    with pytest.raises(InputError, match=next(iter(wrong))):
+        tr.Sequence.from_arrays(**given)
+
+
+def test_without_poses_there_is_no_truth_and_no_folder_of_masks(street, tmp_path):
+    with pytest.raises(InputError, match="poses"):
+        drive(street).poses  # noqa: B018
+    with pytest.raises(InputError, match="list"):
+        tr.LabelMasks(tmp_path, drive(street), 3)
+
+
+def test_the_digest_changes_with_every_part(street):
+    others = [
+        tr.Sequence.from_arrays([*street.images[:5], street.images[0]], street.intrinsics),
+        tr.Sequence.from_arrays(street.images, 2 * street.intrinsics),
+        drive(street, scales=range(6)),
+        drive(street, poses=street.poses),
+    ]
+    digests = {sequence.digest() for sequence in (drive(street), drive(street), *others)}
+    assert len(digests) == 5
