@@ -329,16 +329,12 @@ def boundaries(label_map: np.ndarray, size: tuple[int, int]) -> dict[str, float]
 def thin_boundaries(label_map: np.ndarray, size: tuple[int, int]) -> dict[str, float]:
     """Return the shares (%) of the boundaries of thin objects that are near an edge.
 
-    (Audit rows 81 and 87.) By the thresholds of Canny ("thin 5/15"), and by the size of the label
-    map whose exact boundaries are taken ("thin at 320"). NaN without thin objects.
+    (Audit row 87.) By the thresholds of Canny ("thin 5/15"). NaN without thin objects.
     """
     edges_by_name = {}
     for low, high in ((5, 15), (20, 60), (40, 120)):
         canny = MaskSettings(canny=(low, high))
         edges_by_name[f"thin {low}/{high}"] = masks.edges(label_map, size, canny)
-    for side in (320, 160):
-        small = cv2.resize(label_map, (side, side), interpolation=cv2.INTER_NEAREST)
-        edges_by_name[f"thin at {side}"] = masks.edges(small, size, EXACT)
     thin = masks.edges(label_map, size, THIN) > 0
     return {
         name: _percent(masks.dilate(edges, 2 * NEAR + 1) > 0, thin, least=1)

@@ -354,8 +354,6 @@ SHARES = {  # column of a table: row of the audit, what is measured
     "inside": ("65", "accuracy further inside"),
     "L2": ("71", "edge pixels of either kind that differ with the root of squares"),
     "Gaussian": ("72", "edge pixels of either kind that differ with a Gaussian of 5x5"),
-    "thin at 320": ("81", "boundary pixels of poles and signs kept by label maps of 320x320"),
-    "thin at 160": ("81", "boundary pixels of poles and signs kept by label maps of 160x160"),
     "thin 5/15": ("87", "boundary pixels of poles and signs with an edge, thresholds 5 and 15"),
     "thin 20/60": ("87", "boundary pixels of poles and signs with an edge, thresholds 20 and 60"),
     "thin 40/120": ("87", "boundary pixels of poles and signs with an edge, thresholds 40 and 120"),

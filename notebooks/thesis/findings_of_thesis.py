@@ -4,10 +4,9 @@ from typing import Any
 
 import pandas as pd
 
-from keypoint_study import compare
 from keypoint_study.jobs import CONTROL_WIDTH
 from keypoint_study.report import findings, style, texts
-from thesis import domain_gap, section_4_2, trainings
+from thesis import domain_gap, trainings
 from thesis.settings import Settings
 from thesis_repro.running.files import write_text
 
@@ -30,35 +29,17 @@ def write(
     settings: Settings,
     runs: pd.DataFrame,
     compared: pd.DataFrame,
-    shuffled: pd.DataFrame,
     note: str,
 ) -> str:
     """Write the findings of a run (see `findings.text`) beside the figures, and return them.
 
-    compared: `compare.comparisons` of the runs. shuffled: see `section_4_2`.
+    compared: `compare.comparisons` of the runs.
     """
-    procedure = section_4_2.procedure(runs, shuffled)
-    spans = "{:+.1f} to {:+.1f}".format
-    shown = {
-        "error": procedure["error"],
-        "mean change (%)": procedure["mean"].round(1),
-        "median (%)": procedure["median"].round(1),
-        "improved": procedure["improved"].astype(str) + f" of {procedure['sequences'][0]}",
-        "with a failed run": procedure["failed"],
-        "means of all repetitions (%)": map(spans, procedure["lowest"], procedure["highest"]),
-        "null: mean (%)": procedure["null_mean"].round(1),
-        "null: middle (%)": map(spans, procedure["null_low"], procedure["null_high"]),
-        "null: improved": procedure["null_improved"].round(1),
-    }
     quality = domain_gap.label_map_quality(settings.build).round(3)
     quality = quality.filter(["domain", "images", "classes", "mean_iou", "seen"])
     of_trainings = trainings.table_of_trainings() if settings.figures_in_git else pd.DataFrame()
     more = texts.render(
         "findings_of_thesis.md.j2",
-        widths=procedure["widths"][0],
-        studies=procedure["studies"][0],
-        level=compare.LEVEL,
-        procedure=style.markdown(pd.DataFrame(shown)),
         label_maps=[style.markdown(table) for table in (quality,) if len(table)],
         trainings=[style.markdown(table) for table in (of_trainings,) if len(table)],
         count=trainings.read()["training"].nunique(),

@@ -6,8 +6,6 @@ change is Equation 4.1 of means over the repetitions, in percent; negative is be
 `shuffled` are runs with all keypoints, many repetitions. A metric is "rmse" or "mae".
 """
 
-from typing import Any
-
 import numpy as np
 import pandas as pd
 
@@ -34,7 +32,6 @@ __all__ = [
     "null_distribution",
     "of_chosen_width",
     "percent_change",
-    "procedure",
     "reduced_jobs",
     "stability",
     "table_4_1",
@@ -202,43 +199,3 @@ def _summary_of_studies(studies: pd.DataFrame) -> dict[str, float]:
         f"{of_studies}, from": low,
         f"{of_studies}, to": high,
     }
-
-
-def procedure(runs: pd.DataFrame, shuffled: pd.DataFrame) -> pd.DataFrame:
-    """Return what the thesis's literal procedure gives (Tables 4.2 and 4.3), one row a metric.
-
-    Changes are in percent: mean, median, improved and failed (sequences) of repetition 0; lowest
-    and highest mean of a repetition; null_mean, null_low, null_high and null_improved if masks did
-    nothing (`null_distribution`).
-    """
-    masked, baseline = compare.of_method(runs, "masked"), compare.of_method(runs, "baseline")
-    widths = masked["dilation_width"].nunique()
-    # the embedded world repeats only one width, and one width is no choice
-    widths_run = masked.groupby("repetition")["dilation_width"].nunique()
-    repetitions = sorted(widths_run.index[widths_run == widths])
-    best = of_chosen_width(masked[masked["repetition"] == 0])
-    rows: dict[str, dict[str, Any]] = {}
-    for metric in ("rmse", "mae"):
-        single = pd.DataFrame(
-            {each: changes_of_repetition(masked, baseline, metric, each) for each in repetitions}
-        )
-        means = single.mean()
-        studies = null_distribution(shuffled, widths, metric)
-        null_low, null_high = middle(studies.mean(axis=1))
-        rows[compare.METRICS[metric]] = {
-            "mean": means[0],
-            "median": single[0].median(),
-            "improved": (single[0] < 0).sum(),
-            "sequences": len(single),
-            "failed": compare.has_failed(best).sum(),
-            "lowest": means.min(),
-            "highest": means.max(),
-            "repetitions": len(means),
-            "widths": widths,
-            "studies": len(studies),
-            "null_mean": studies.mean(axis=1).mean(),
-            "null_low": null_low,
-            "null_high": null_high,
-            "null_improved": (studies < 0).sum(axis=1).mean(),
-        }
-    return pd.DataFrame.from_dict(rows, orient="index").rename_axis("error").reset_index()
