@@ -79,8 +79,9 @@ def test_the_first_training_is_that_of_the_comparison():
 
 @pytest.fixture
 def examples(small_world, tmp_path, monkeypatch):
-    """The Python examples on own masks, run in a folder with frames and a video of a drive."""
+    """The Python recipes for what people bring, run beside a world and its frames and video."""
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "world").symlink_to(small_world)
     (tmp_path / "frames").symlink_to(small_world / "kitti/sequences/00/image_0")
     images = [cv2.imread(str(path)) for path in sorted((tmp_path / "frames").iterdir())]
     height, width = images[0].shape[:2]
@@ -90,24 +91,35 @@ def examples(small_world, tmp_path, monkeypatch):
     video.release()
     results = []
     for example in blocks(ROOT / "docs/own-masks.md", "python"):
-        names = {}
+        names = {"lines": len(example.splitlines())}
         exec(example, names)
         results.append(names)
     return images, results
 
 
-def test_the_examples_on_own_masks_run(examples, tmp_path):
-    images, (masks, calls, _) = examples
-    step, mask = masks["step"], masks["mask_of"](images[-1][..., 0])
-    u, v = step.keypoints.astype(int).T
+def test_the_recipes_for_what_people_bring_run(examples, tmp_path):
+    images, (memory, network, step, detectors, own, video) = examples
+    assert max(recipe["lines"] for recipe in (memory, step, detectors, video)) <= 15
+
+    drive, result = memory["drive"], memory["result"]
+    assert len(drive) == len(images) == len(result.poses)
+    np.testing.assert_allclose(drive.scales[1:], 8.3 / 25)
+    assert 3 < np.linalg.norm(result.poses[-1, :3, 3]) < 3.7  # eleven steps
+
+    last, mask = network["step"], network["mask_of"](images[-1][..., 0])
+    u, v = last.keypoints.astype(int).T
     assert len(u) > 100 and mask[v, u].all()
-    assert step.previous.shape == step.current.shape == (len(step.inliers), 2)
-    assert 10 < np.linalg.norm(step.pose[:3, 3]) < 11.1  # eleven steps of a metre
-    picture = cv2.imread("keypoints.png")
-    assert np.count_nonzero((picture != picture[..., :1]).any(axis=2)) > 1000
-    for image in images[:3]:
-        step = calls["odometry"].step(image[..., 0], 1.0)
-    assert step.updated and step.inliers.sum() > 50
-    first = cv2.imread("my-drive/000000.png", cv2.IMREAD_UNCHANGED)
+    assert 10 < np.linalg.norm(last.pose[:3, 3]) < 11.1  # eleven steps of a metre
+
+    picture = cv2.imread("step.png")
+    red, green = ((picture == colour).all(axis=2).sum() for colour in ((0, 0, 255), (0, 255, 0)))
+    assert step["step"].frame == 7 and min(green, red) > 0
+    assert cv2.imread("paths.png") is not None and len(detectors["runs"]) == 3
+
+    counts = own["result"].frames["detected"]
+    plain = own["detect"](images[0][..., 0], None, None)
+    assert counts[0] == len(plain) and own["result"].frames["updated"][1:].all()
+
+    first = cv2.imread("my-drive/000001.png", cv2.IMREAD_UNCHANGED)
     assert len(list((tmp_path / "my-drive").iterdir())) == len(images)
     assert first.ndim == 2 and first.dtype == np.uint8
