@@ -119,17 +119,32 @@ def test_errors_of_a_run():
     assert metrics.errors(true[:5], true[:5])["rmse"] == 0
 
 
+OPENGL = np.diag([1.0, -1, -1, 1])  # axes of a camera
 AXES = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])  # x forward, z up
+
+
+def quaternions(poses, order, sign=1):
+    """Poses whose quaternions x, y, z, w are read in another order, or as their inverse."""
+    read = np.array(poses)
+    numbers = Rotation.from_matrix(poses[:, :3, :3]).as_quat() * [sign, sign, sign, 1]
+    read[:, :3, :3] = Rotation.from_quat(numbers[:, order]).as_matrix()
+    return read
 
 
 @pytest.mark.parametrize(
     "change, kind",
     [
         (lambda poses: poses, None),
-        (np.linalg.inv, "inverse"),
-        (lambda poses: poses[::-1], "reversed"),
-        (lambda poses: AXES @ poses @ AXES.T, "turned"),
-        (lambda poses: poses[np.random.default_rng(0).permutation(len(poses))], ""),
+        (np.linalg.inv, "are world-to-camera poses; invert"),
+        (lambda poses: poses[::-1], "in reverse order"),
+        (lambda poses: OPENGL @ poses @ OPENGL, "diag(1, -1, -1, 1)"),
+        (lambda poses: poses @ OPENGL, "diag(1, -1, -1, 1)"),
+        (lambda poses: OPENGL @ np.linalg.inv(poses) @ OPENGL, "inv(poses) @ diag(1, -1, -1, 1)"),
+        (lambda poses: quaternions(poses, [3, 0, 1, 2]), "w first"),
+        (lambda poses: quaternions(poses, [1, 2, 3, 0]), "w last"),
+        (lambda poses: quaternions(poses, [0, 1, 2, 3], -1), "invert the rotations"),
+        (lambda poses: AXES @ poses @ AXES.T, "a body with other axes"),
+        (lambda poses: poses[np.random.default_rng(0).permutation(len(poses))], "do not fit"),
     ],
 )
 def test_true_poses_that_are_not_the_cameras_are_told(change, kind):
@@ -137,7 +152,12 @@ def test_true_poses_that_are_not_the_cameras_are_told(change, kind):
     estimated = true.copy()
     estimated[:, :3, 3] += np.random.default_rng(1).normal(0, 0.05, (60, 3))
     reason = metrics.foreign_truth(estimated, change(true))
-    assert reason == "" if kind is None else metrics.TRUTH_KINDS[kind] in reason
+    assert reason == "" if kind is None else kind in reason
+    # a path of one camera without its scale
+    path = np.array(change(true))
+    path[:, :3, 3] *= 0.05
+    told = metrics.foreign_poses(path, estimated)
+    assert told == "" if kind is None else kind in told
     # what did not move, and too few steps, say nothing
     assert metrics.foreign_truth(np.tile(np.eye(4), (60, 1, 1)), change(true)) == ""
     assert metrics.foreign_truth(estimated[:9], change(true)[:9]) == ""

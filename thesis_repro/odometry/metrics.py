@@ -1,5 +1,6 @@
 """Errors of an estimated path: the thesis's RMSE and MAE (Section 3.4), and other measures."""
 
+from collections.abc import Callable
 from typing import Any
 
 import evo
@@ -187,53 +188,118 @@ def step_errors(estimated: np.ndarray, true: np.ndarray) -> dict[str, float]:
 
 
 FOREIGN_DIRECTION, EXPLAINED = 45.0, 15.0  # degrees; 5.9 is the largest of healthy recorded runs
-MIN_STEPS = 10  # of a path, to say what its true poses are
-TRUTH_KINDS = {
-    "inverse": "are world-to-camera poses; invert each of them",
-    "reversed": "are in reverse order",
-    "turned": "are those of a body with other axes; the camera's are x right, y down, z forward",
-    "": "do not fit these frames, or the odometry fails on them",
+BETTER = 0.25  # share of the errors' product that the right convention leaves
+MIN_STEPS = 10  # of a path, to say what its poses are
+OPENGL = np.diag([1.0, -1, -1, 1])
+
+
+def _with_quaternions(poses: np.ndarray, order: list[int]) -> np.ndarray:
+    """Poses whose quaternions (x, y, z, w) have their numbers in another order."""
+    changed = poses.copy()
+    quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+    changed[:, :3, :3] = Rotation.from_quat(quaternions[:, order]).as_matrix()
+    return changed
+
+
+def _with_inverse_rotations(poses: np.ndarray) -> np.ndarray:
+    changed = poses.copy()
+    changed[:, :3, :3] = poses[:, :3, :3].swapaxes(1, 2)
+    return changed
+
+
+# {what poses of another convention most likely are: what makes the camera's of them}
+CONVENTIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "have OpenGL's axes (y up, z backward); the camera's are poses @ diag(1, -1, -1, 1)": (
+        lambda poses: poses @ OPENGL
+    ),
+    "are world-to-camera poses; invert each of them": np.linalg.inv,
+    "are world-to-camera poses of OpenGL's axes; inv(poses) @ diag(1, -1, -1, 1) are the camera's": (
+        lambda poses: np.linalg.inv(poses) @ OPENGL
+    ),
+    "have quaternions with w first, which this format has last": (
+        lambda poses: _with_quaternions(poses, [1, 2, 3, 0])
+    ),
+    "have quaternions with w last, which this format has first": (
+        lambda poses: _with_quaternions(poses, [3, 0, 1, 2])
+    ),
+    "have rotations of the world to the camera beside positions of the camera; invert the rotations": (
+        _with_inverse_rotations
+    ),
+    "are in reverse order": lambda poses: poses[::-1],
 }
+TURNED = "are those of a body with other axes; the camera's are x right, y down, z forward"
+UNKNOWN = "do not fit these frames, or the odometry fails on them"
+
+
+def foreign_poses(poses: np.ndarray, reference: np.ndarray) -> str:
+    """Return what poses of another convention than the camera's most likely are, or an empty text.
+
+    poses, reference: paths, (n, 4, 4), of the same frames; the second ones are right. No
+    working odometry is off by FOREIGN_DIRECTION degrees in the median direction of its steps, and
+    no one of CONVENTIONS leaves less than BETTER of the product of right poses' errors in direction
+    and rotation. Only steps of MIN_DIRECTED_STEP or more count.
+    """
+    given = _misfit(poses, reference)
+    kind, limits, product = "", given, BETTER * given.prod()  # NaN for too few steps
+    if given[0] > FOREIGN_DIRECTION:
+        kind, limits, product = UNKNOWN, np.array([EXPLAINED, np.inf]), np.inf
+    misfits = {text: _misfit(changed(poses), reference) for text, changed in CONVENTIONS.items()}
+    fitting = {
+        text: misfit.prod()
+        for text, misfit in misfits.items()
+        if (misfit < limits).all() and misfit.prod() < product
+    }
+    if kind:
+        misfit = _misfit(_turned(poses, reference), reference)
+        if misfit[0] < EXPLAINED:  # a rotation that is fitted explains the others as well
+            fitting[TURNED] = misfit.prod() / BETTER
+    if fitting:
+        kind = min(fitting, key=lambda text: fitting[text])
+    if not kind:
+        return ""
+    return (
+        f"steps point {given[0]:.0f} degrees (median) elsewhere and turn by {given[1]:.2g} (mean) otherwise, "
+        f"so these poses most likely {kind}"
+    )
 
 
 def foreign_truth(estimated: np.ndarray, true: np.ndarray) -> str:
     """Return what is wrong with true poses that cannot be those of the camera, or an empty text.
 
-    estimated, true: (n, 4, 4) each. No working odometry is off by FOREIGN_DIRECTION degrees in the
-    median direction of its steps. The text names the one of TRUTH_KINDS that brings the median
-    below EXPLAINED. Only steps of MIN_DIRECTED_STEP or more that moved the estimate count.
+    estimated, true: (n, 4, 4) each. See `foreign_poses`.
     """
-    angle = _direction_error(estimated, true)
-    if not angle > FOREIGN_DIRECTION:  # NaN for too few steps
-        return ""
-    errors = {
-        "inverse": _direction_error(estimated, np.linalg.inv(true)),
-        "reversed": _direction_error(estimated, true[::-1]),
-    }
-    kind = min(errors, key=lambda name: errors[name])
-    if not errors[kind] < EXPLAINED:
-        kind = "turned" if _direction_error(estimated, true, turned=True) < EXPLAINED else ""
-    return (
-        f"true steps point {angle:.0f} degrees (median) away from the estimated ones, so these poses "
-        f"most likely {TRUTH_KINDS[kind]}"
-    )
+    reason = foreign_poses(true, estimated)
+    return f"true {reason}" if reason else ""
 
 
-def _direction_error(estimated: np.ndarray, true: np.ndarray, turned: bool = False) -> float:
-    """Median angle, degrees, between the estimated and true directions of steps; NaN for few steps.
+def _steps_to_compare(poses: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Steps of two paths that both move, and one of them by MIN_DIRECTED_STEP or more."""
+    steps, right = _motions(poses), _motions(reference)
+    lengths = np.array([_length(steps), _length(right)])
+    counts = (lengths.min(axis=0) > 0) & (lengths.max(axis=0) >= MIN_DIRECTED_STEP)
+    return steps[counts], right[counts]
 
-    turned: after the one rotation that fits best.
+
+def _misfit(poses: np.ndarray, reference: np.ndarray) -> np.ndarray:
+    """Median angle between the directions of steps, and mean rotation error of a step, degrees.
+
+    NaN for few steps.
     """
-    steps, true_steps = _motions(estimated), _motions(true)
-    counts = (_length(true_steps) >= MIN_DIRECTED_STEP) & (_length(steps) > 0)
-    if counts.sum() < MIN_STEPS:
-        return np.nan
-    heading = _directions(steps[counts, :3, 3])
-    true_heading = _directions(true_steps[counts, :3, 3])
-    if turned:
-        true_heading = Rotation.align_vectors(heading, true_heading)[0].apply(true_heading)
-    cosine = np.clip((heading * true_heading).sum(axis=1), -1, 1)
-    return float(np.degrees(np.median(np.arccos(cosine))))
+    steps, right = _steps_to_compare(poses, reference)
+    if len(steps) < MIN_STEPS:
+        return np.full(2, np.nan)
+    cosine = (_directions(steps[:, :3, 3]) * _directions(right[:, :3, 3])).sum(axis=1)
+    angle = np.degrees(np.median(np.arccos(np.clip(cosine, -1, 1))))
+    return np.array([angle, angles(np.linalg.inv(right) @ steps).mean()])
+
+
+def _turned(poses: np.ndarray, reference: np.ndarray) -> np.ndarray:
+    """Poses in the axes in which the directions of their steps fit best."""
+    steps, right = _steps_to_compare(poses, reference)
+    turn = np.eye(4)
+    headings = _directions(right[:, :3, 3]), _directions(steps[:, :3, 3])
+    turn[:3, :3] = Rotation.align_vectors(*headings)[0].as_matrix()
+    return turn @ poses @ turn.T
 
 
 STARTS, ENDS = slice(None, -1), slice(1, None)  # of all steps
