@@ -83,7 +83,7 @@ def write(settings, folder):
         _copy(settings.figures, name, folder)
     style.save_all(
         {
-            "few_keypoints": few_keypoints.figure_of_few(few, times),
+            "few_keypoints": few_keypoints.figure_of_few(few),
             "worth": report_worth.figure(worths),
         },
         {

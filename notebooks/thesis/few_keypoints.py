@@ -215,18 +215,14 @@ def table_of_few(rows: pd.DataFrame, times: pd.DataFrame | None = None) -> pd.Da
     return pd.DataFrame(lines)
 
 
-def figure_of_few(rows: pd.DataFrame, times: pd.DataFrame | None = None) -> Figure:
-    """Draw the ratios of both errors against the number of keypoints, and the time of a frame.
+def figure_of_few(rows: pd.DataFrame) -> Figure:
+    """Draw the ratios of both errors against the number of keypoints. rows: of `ratios_to_all`.
 
-    Ratios near 1 are drawn once more, enlarged; arrows there mark intervals that are cut. rows: of
-    `ratios_to_all`. times: of `time_steps`, drawn below the errors if given.
+    Ratios near 1 are drawn once more, enlarged; arrows there mark intervals that are cut.
     """
-    more = times is not None
     scales = list(product(ERRORS, (False, True)))
-    drawing, panels = style.new_figure(
-        len(scales) + more, len(ESTIMATORS), sharex=True, height=9 + 1.6 * more
-    )
-    for (error, near), panel_row in zip(scales, panels, strict=False):
+    drawing, panels = style.new_figure(len(scales), len(ESTIMATORS), sharex=True, height=9)
+    for (error, near), panel_row in zip(scales, panels, strict=True):
         for panel, estimator in zip(panel_row, ESTIMATORS, strict=True):
             shown = rows[(rows["error"] == error) & (rows["estimator"] == estimator)]
             _draw_curves(panel, shown, near)
@@ -235,26 +231,11 @@ def figure_of_few(rows: pd.DataFrame, times: pd.DataFrame | None = None) -> Figu
             if not near:
                 style.ratio_axis(panel.yaxis, rows[["ratio", "low", "high"]].to_numpy())
         panel_row[0].set_ylabel("ratio to all keypoints")
-    if times is not None:
-        numbers = rows.drop_duplicates(["choice", "number"])[["choice", "number", "keypoints"]]
-        _draw_times(panels[-1, 0], times.merge(numbers, on=["choice", "number"]))
-        panels[-1, 1].axis("off")
-    for panel in (panels[-1, 0], panels[len(scales) - 1, -1]):
+    for panel in panels[-1]:
         panel.set_xlabel("keypoints a frame")
         panel.tick_params(labelbottom=True)
     style.legend_below(drawing, panels.ravel()[:1], 3)
     return drawing
-
-
-def _draw_times(panel: plt.Axes, timed: pd.DataFrame) -> None:
-    for index, choice in enumerate(LABELS):
-        of_choice = timed[timed["choice"] == choice].sort_values("keypoints")
-        look = style.line_style(index)
-        panel.plot(of_choice["keypoints"], of_choice["milliseconds"], marker="o", **look)
-    (place,) = timed.loc[timed["choice"] == "all", ["keypoints", "milliseconds"]].to_numpy()
-    panel.annotate("all", place, (-8, 0), textcoords="offset points", ha="right")
-    panel.set_ylabel("CPU time a frame (ms)")
-    panel.set_ylim(0)
 
 
 def _draw_curves(panel: plt.Axes, rows: pd.DataFrame, near: bool) -> None:

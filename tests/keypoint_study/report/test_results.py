@@ -335,8 +335,7 @@ def test_the_curve_of_few_keypoints_shows_every_ratio():
         for estimator in few_keypoints.ESTIMATORS
         for error in few_keypoints.ERRORS
     ]
-    times = pd.DataFrame({"choice": ["all"], "number": [0], "milliseconds": [50.0]})
-    figure = few_keypoints.figure_of_few(pd.DataFrame(rows), times)
+    figure = few_keypoints.figure_of_few(pd.DataFrame(rows))
     assert problems(figure) == []
     wide, enlarged = figure.axes[0:2] + figure.axes[4:6], figure.axes[2:4] + figure.axes[6:8]
     for panel in wide:
