@@ -1,6 +1,6 @@
 """The one place that compares: a table of runs goes in, a table of comparisons comes out.
 
-**Runs** (`runner.run_jobs`) have one row a run: sequence, run, source, method, dilation_width,
+**Runs** (`runner.run_all`) have one row a run: sequence, run, source, method, dilation_width,
 estimator, repetition, frames, mean_keypoints, flagged, and one column for each of METRICS.
 
 **Comparisons** (`comparisons`) have one row for each method, reference, metric and estimator: the

@@ -28,6 +28,7 @@ class OtherFrame:
     def __init__(self, source: Source, sequence: Sequence, dilation_width: int | None) -> None:
         self.sequence = sequence
         self.masks = source.masks(sequence, dilation_width)
+        self.paths = self.masks.paths
         self.line_width = dilation_width or LINE_WIDTH
 
     def __len__(self) -> int:

@@ -6,15 +6,17 @@ the number of keypoints that masks leave, so they are made once the masked runs 
 (`runner.keypoint_controls`).
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
+from functools import cache
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from keypoint_study.methods import MASK_CONTROLS, OF_LABEL_MAPS
-from keypoint_study.sources import UNMASKED, Source
+from keypoint_study.methods import LABEL_MAPS, MASK_CONTROLS, METHODS, changed
+from keypoint_study.sources import UNMASKED, Source, by_name
 from thesis_repro.data.kitti import TRUE_LABELS, Sequence
+from thesis_repro.errors import InputError
 from thesis_repro.odometry import OdometrySettings, estimators
 
 # Pixels: the dilation width of Section 3.6 and Figures 3.6 and 4.5, at which masks are tested. It
@@ -22,9 +24,6 @@ from thesis_repro.odometry import OdometrySettings, estimators
 CONTROL_WIDTH = 10
 # {name: title}
 ESTIMATORS = {name: estimator.title for name, estimator in estimators.ESTIMATORS.items()}
-# Passes for each of several workers. Every pass decodes and tracks anew: a sequence on two workers
-# takes 13 % more CPU time than in one pass, and with 4 pieces 35 %.
-PIECES = 2
 
 
 @dataclass(frozen=True)
@@ -69,16 +68,62 @@ class Job:
             return f"{self.source}/{name}"
         return name
 
-    def changed(self, settings: OdometrySettings) -> OdometrySettings:
-        """Return settings of the odometry with the changes that the job asks for."""
-        changes: dict[str, Any] = {
+    def changes(self) -> dict[str, Any]:
+        """Return the settings of the odometry that the job asks for."""
+        asked: dict[str, Any] = {
             "estimator": estimators.ESTIMATORS[self.estimator].make,
             "max_keypoints": self.max_keypoints,
             "min_distance": self.min_distance,
             "shuffle_seed": self.repetition or None,
         }
-        given = {name: value for name, value in changes.items() if value is not None}
-        return replace(settings, **given)
+        return {name: value for name, value in asked.items() if value is not None}
+
+
+class Run(NamedTuple):
+    """A run of the odometry. masks: see `runner.run_all`."""
+
+    sequence: Sequence
+    settings: OdometrySettings
+    masks: Any
+
+
+def runs_of(
+    jobs: Iterable[Job],
+    sequences: Iterable[Sequence],
+    sources: Path | Iterable[Source],
+    settings: Mapping[str, Any] = {},
+    masked_settings: Mapping[str, Any] = {},
+) -> dict[Job, Run | str]:
+    """Return the runs of jobs, or the reason why one cannot run, as `runner.run_all` takes them.
+
+    sources: of the jobs, or a folder with one folder of label maps a sequence. settings: changes of
+    all runs; masked_settings: of those with masks. Jobs with the same masks get the same object, by
+    which `odometry.run_many` recognises that they share work.
+    """
+    sources_by_name = by_name(sources)
+    default = next(iter(sources_by_name.values()))
+    opened = {sequence.name: sequence for sequence in sequences}
+
+    @cache
+    def choice(method: str, sequence: str, source: str, width: int | None) -> Any:
+        try:
+            given = sources_by_name.get(source, default)
+            return METHODS[method].choose(opened[sequence], given, width)
+        except InputError as error:
+            return str(error)
+
+    runs: dict[Job, Run | str] = {}
+    for job in jobs:
+        chosen = choice(job.method, job.sequence, job.source, job.dilation_width)
+        if isinstance(chosen, str):
+            runs[job] = chosen
+            continue
+        own, masks = chosen
+        changes = {**settings, **job.changes()}
+        if masks is not None and job.method not in UNMASKED:
+            changes |= masked_settings
+        runs[job] = Run(opened[job.sequence], changed(own, changes), masks)
+    return runs
 
 
 def first_jobs(
@@ -88,13 +133,14 @@ def first_jobs(
     tested: int | None = None,
     sources: Iterable[Source] = (Source(Path()),),
     repetitions: int = 1,
+    named: Collection[str] = (),
 ) -> list[Job]:
     """Return the jobs that need no other results.
 
     These are all keypoints, masks of every width, and the controls that are masks.
     widths: pixels, for masks from label maps, by estimator: {"thesis": range(1, 16)}.
     tested: width (pixels) of the controls, None for no controls; it is added to the widths of every
-    estimator.
+    estimator. named: controls that not every study runs.
     sources: of masks, keypoints or paths. All keypoints are run once for all sources.
     """
     all_widths = set(chain(*widths.values()))
@@ -111,7 +157,7 @@ def first_jobs(
             of_source = sorted(all_widths) if source.has_width else [None]
             jobs += [replace(masks, dilation_width=width) for width in of_source]
             if tested:
-                controls = mask_controls(source, sequence, tested).items()
+                controls = mask_controls(source, sequence, tested, named).items()
                 jobs += [
                     replace(masks, method=name, dilation_width=width) for name, width in controls
                 ]
@@ -124,16 +170,19 @@ def first_jobs(
     ]
 
 
-def mask_controls(source: Source, sequence: Sequence, width: int | None) -> dict[str, int | None]:
+def mask_controls(
+    source: Source, sequence: Sequence, width: int | None, named: Collection[str] = ()
+) -> dict[str, int | None]:
     """Return {method: its width} of the controls that are masks, which a source allows.
 
-    width: pixels, of masks from label maps.
+    width: pixels, of masks from label maps. named: controls that not every study runs.
     """
-    allowed = {
-        method: width if source.has_width or method in OF_LABEL_MAPS else None
-        for method in MASK_CONTROLS
-        if source.has_label_maps or method not in OF_LABEL_MAPS
-    }
+    allowed: dict[str, int | None] = {}
+    for name in MASK_CONTROLS:
+        method = METHODS[name]
+        is_of_labels = method.group == LABEL_MAPS
+        if (method.every_study or name in named) and (source.has_label_maps or not is_of_labels):
+            allowed[name] = width if source.has_width or is_of_labels else None
     if not (sequence.folder / TRUE_LABELS).is_dir():
         allowed.pop("true-labels", None)
     return allowed
@@ -147,32 +196,3 @@ def repeated(jobs: Iterable[Job], estimators: Iterable[str], repetitions: int) -
         for estimator in estimators
         for repetition in range(repetitions)
     ]
-
-
-def in_passes(
-    jobs: Iterable[Job], sequences: Mapping[str, Sequence], workers: int
-) -> list[list[Job]]:
-    """Divide jobs into lists, each for one pass over a sequence. sequences: by name.
-
-    Each of several workers gets about PIECES passes, so that all end at about the same time. Jobs
-    with the same keypoints stay in one pass, where they share most of their work. A single worker
-    gets one pass a sequence. Own keypoints and paths share nothing.
-    """
-    groups: dict[Job, list[Job]] = {}
-    passes: list[list[Job]] = []
-    for job in jobs:
-        if job.method in UNMASKED:
-            passes.append([job])
-            continue
-        same_keypoints = replace(job, estimator="", repetition=0)
-        groups.setdefault(same_keypoints, []).append(job)
-    # work is measured in frames, of which a group of jobs reads each once
-    work = sum(len(sequences[key.sequence]) for key in groups)
-    for name, sequence in sequences.items():
-        groups_of_sequence = [group for key, group in groups.items() if key.sequence == name]
-        size = len(groups) or 1
-        if workers > 1:
-            size = max(1, round(work / (PIECES * workers) / len(sequence)))
-        starts = range(0, len(groups_of_sequence), size)
-        passes += [list(chain(*groups_of_sequence[start : start + size])) for start in starts]
-    return passes

@@ -3,10 +3,10 @@
 A method chooses the keypoints of a run. Beside all keypoints and masks, there are *controls*: masks
 and settings that leave as many keypoints as the masks of the segmentation, chosen differently. If
 the odometry gains as much from a control, the segmentation is not what helps. A new method is a
-function and an entry in METHODS, a new error of a path one in study/errors.py.
+function and an entry in METHODS, a new error of a path one in errors.py.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple, TypeAlias
 
@@ -39,7 +39,7 @@ def masked(sequence: Sequence, source: Source, width: int | None) -> Choice:
 
 def brought(sequence: Sequence, source: Source, width: int | None) -> Choice:
     """Run with what the source brings in place of the odometry or parts of it."""
-    return THESIS, source
+    return THESIS, replace(source, folder=source.file(sequence.name))
 
 
 def altered(masks: type[OtherFrame]) -> Callable[..., Choice]:
@@ -47,7 +47,7 @@ def altered(masks: type[OtherFrame]) -> Callable[..., Choice]:
     return lambda sequence, source, width: (THESIS, masks(source, sequence, width))
 
 
-def made_with(settings: MaskSettings | None = None, **changes: Any) -> Callable[..., Choice]:
+def with_masks(settings: MaskSettings | None = None, **changes: Any) -> Callable[..., Choice]:
     """Return a method with other masks from the same label maps.
 
     settings: of the masks; None: those of the source, with changes.
@@ -68,18 +68,29 @@ def from_true_labels(sequence: Sequence, source: Source, width: int | None) -> C
     return masked(sequence, true, width)
 
 
+def changed(own: OdometrySettings, changes: Mapping[str, Any]) -> OdometrySettings:
+    """Return a method's settings with the changes of a study, but for those that it sets itself."""
+    free = {name for name, value in vars(own).items() if value == getattr(THESIS, name)}
+    return replace(own, **{name: value for name, value in changes.items() if name in free})
+
+
 class Method(NamedTuple):
     """A way to choose the keypoints of a run.
 
     title: in tables and figures. group: REFERENCE, BROUGHT by the user, from LABEL_MAPS of the
-    user, a CONTROL without segmentation, which keeps as many keypoints as the masks do but knows
-    nothing of the classes, or THESIS_ONLY, for a figure of the thesis. choose: from a sequence, a
-    source and a width to the settings and masks of a run.
+    user, a CONTROL without segmentation, which keeps as many pixels or keypoints as the masks do
+    but knows nothing of the classes, or THESIS_ONLY, for a figure of the thesis. choose: from a
+    sequence, a source and a width to the settings and masks of a run. Its own settings win over
+    those of a study.
+    every_study: whether every study with controls runs it; else those that name it (--controls
+    NAME). as_many: whether the job says how many keypoints it keeps, as many as the masks.
     """
 
     title: str
     group: str
     choose: Callable[[Sequence, Source, int | None], Choice]
+    every_study: bool = True
+    as_many: bool = False
 
 
 REFERENCE, BROUGHT, LABEL_MAPS, CONTROL, THESIS_ONLY = (
@@ -95,25 +106,27 @@ METHODS = {  # in the order in which they are shown
     "keypoints": Method("own keypoints", BROUGHT, brought),  # these two as sources.KINDS has them
     "paths": Method("path of another system", BROUGHT, brought),
     "exact-boundaries": Method(
-        "exact class boundaries", LABEL_MAPS, made_with(boundaries="exact", keep="boundaries")
+        "exact class boundaries", LABEL_MAPS, with_masks(boundaries="exact", keep="boundaries")
     ),
-    "corrected": Method("corrected mask", LABEL_MAPS, made_with(CORRECTED)),
+    "corrected": Method("corrected mask", LABEL_MAPS, with_masks(CORRECTED)),
     "static-boundaries": Method(
-        "boundaries of static things", LABEL_MAPS, made_with(keep="static-boundaries")
+        "boundaries of static things", LABEL_MAPS, with_masks(keep="static-boundaries")
     ),
-    "static": Method("all but movable things", LABEL_MAPS, made_with(keep="static")),
-    "inverse": Method("all but the boundaries", LABEL_MAPS, made_with(keep="inverse")),
+    "static": Method("all but movable things", LABEL_MAPS, with_masks(keep="static")),
+    "inverse": Method("all but the boundaries", LABEL_MAPS, with_masks(keep="inverse")),
     "true-labels": Method("true label maps", LABEL_MAPS, from_true_labels),
     "other-frame": Method("mask of another frame", CONTROL, altered(OtherFrame)),
     "mirrored": Method("mirrored mask", CONTROL, altered(Mirrored)),
     "random-lines": Method("random lines", CONTROL, altered(RandomLines)),
     "image-edges": Method("edges of the image", CONTROL, altered(ImageEdges)),
-    # these two as many keypoints as masks leave, which the job says
-    "fewer": Method("fewer keypoints", CONTROL, all_keypoints),
-    "spread": Method("keypoints spread out", CONTROL, all_keypoints),
+    "fewer": Method("fewer keypoints", CONTROL, all_keypoints, as_many=True),
+    "spread": Method("keypoints spread out", CONTROL, all_keypoints, as_many=True),
     "reduced": Method("reduced keypoints", THESIS_ONLY, all_keypoints),  # Figure 4.12
 }
 AS_SLAM_SYSTEMS = ("static", "inverse", "static-boundaries")
-OF_LABEL_MAPS = ("exact-boundaries", "corrected", *AS_SLAM_SYSTEMS, "true-labels")
-# the methods with masks beside "masked", in the order of their runs
-MASK_CONTROLS = ("other-frame", "mirrored", "random-lines", "image-edges", *OF_LABEL_MAPS)
+# the methods with masks beside "masked", which the tested width of a study is for
+MASK_CONTROLS = [
+    name
+    for name, method in METHODS.items()
+    if method.group in (CONTROL, LABEL_MAPS) and not method.as_many
+]

@@ -24,7 +24,8 @@ class Study:
     sequences: their names. widths: pixels, for masks from label maps. tested: width of the
     controls, None for no controls. estimators: some of `jobs.ESTIMATORS`. frames: number of frames
     of each sequence, None for all. scale_gate: metres, see OdometrySettings. masked_settings: other
-    settings of the odometry, for all runs with masks. without_border: of Sequence.
+    settings of the odometry, for all runs with masks. without_border: of Sequence. controls: those
+    that not every study runs.
     """
 
     kitti: Path
@@ -38,6 +39,7 @@ class Study:
     scale_gate: float = THESIS.scale_gate
     masked_settings: dict[str, Any] = field(default_factory=dict)
     without_border: bool = False
+    controls: tuple[str, ...] = ()
 
     @cached_property
     def opened(self) -> list[Sequence]:
@@ -64,35 +66,44 @@ class Study:
         sources.check(self.sources, self.opened, widths)
 
     def run(self, folder: Path, processes: int = 1, scheduler: str | None = None) -> runner.Outcome:
-        """Run the jobs whose results are not in the folder yet, see `runner.run_jobs`.
+        """Run the jobs whose results are not in the folder yet, see `runner.run_all`.
 
         Sequences whose true poses are not the camera's are left out of the table, with a warning.
         Raises InputError for a folder with results of another number of frames, and if no sequence
         is left.
         """
-        run_jobs = partial(
-            runner.run_jobs,
+        settings = {"scale_gate": self.scale_gate}
+        more = {"without_border": True} if self.without_border else {}
+        runs_of = partial(
+            jobs.runs_of,
             sequences=self.opened,
             sources=self.sources,
-            folder=folder / RUNS,
-            processes=processes,
-            scheduler=scheduler,
-            scale_gate=self.scale_gate,
+            settings=settings,
             masked_settings=self.masked_settings,
         )
+        run_all = partial(
+            runner.run_all, folder=folder / RUNS, processes=processes, scheduler=scheduler
+        )
         with provenance.claimed(folder):
-            settings = {"scale_gate": self.scale_gate, **self.masked_settings}
-            if self.without_border:
-                settings["without_border"] = True
-            provenance.stage(folder, replace=False, frames=self.frames, **settings)
-            first_jobs = jobs.first_jobs(
-                self.opened,
-                dict.fromkeys(self.estimators, self.widths),
-                tested=self.tested,
-                sources=self.sources,
-                repetitions=self.repetitions,
+            provenance.stage(
+                folder,
+                replace=False,
+                frames=self.frames,
+                **settings,
+                **self.masked_settings,
+                **more,
             )
-            outcome = first = run_jobs(first_jobs)
+            runs = runs_of(
+                jobs.first_jobs(
+                    self.opened,
+                    dict.fromkeys(self.estimators, self.widths),
+                    tested=self.tested,
+                    sources=self.sources,
+                    repetitions=self.repetitions,
+                    named=self.controls,
+                )
+            )
+            outcome = first = run_all(runs)
             if (first.table["method"] == "baseline").all():
                 raise InputError(
                     "every run but those with all keypoints failed (see above), so there is nothing to "
@@ -100,7 +111,7 @@ class Study:
                 )
             foreign = self._foreign_truths(first.table, folder)
             if self.tested:
-                more_jobs = runner.keypoint_controls(
+                as_many = runner.keypoint_controls(
                     first.table,
                     self.opened,
                     self.sources,
@@ -108,16 +119,8 @@ class Study:
                     self.tested,
                     self.estimators,
                 )
-                done = set(zip(first.table["sequence"], first.table["run"], strict=True))
-                done_jobs = [job for job in first_jobs if (job.sequence, job.name) in done]
-                both = run_jobs(done_jobs + more_jobs)
-                outcome = replace(
-                    both,
-                    made=both.made + first.made,
-                    kept=both.kept - first.made,  # the runs of the first call count as kept
-                    failed_jobs=both.failed_jobs + first.failed_jobs,
-                    warnings=first.warnings + both.warnings,
-                )
+                done = {job: run for job, run in runs.items() if job not in first.reasons}
+                outcome = run_all(done | runs_of(as_many)).after(first)
         table = outcome.table[~outcome.table["sequence"].isin(foreign)]
         return replace(outcome, table=table, warnings=[*outcome.warnings, *foreign.values()])
 
@@ -164,6 +167,7 @@ class Study:
             scheduler=scheduler,
             with_controls=self.tested is not None,
             masked_settings=self.masked_settings,
+            named=self.controls,
         )
 
     @property

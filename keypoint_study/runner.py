@@ -4,93 +4,93 @@ They run here or on a cluster. Each finished run is one CSV file with one row a 
 run again. Errors are computed from these files.
 """
 
-import inspect
 import json
 import textwrap
-from collections.abc import Iterable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import cache
+from itertools import chain
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import cv2
 import numpy as np
 import pandas as pd
 
 from keypoint_study import compare
-from keypoint_study.controls import OtherFrame, min_distance
+from keypoint_study.controls import min_distance
 from keypoint_study.errors import path_errors
-from keypoint_study.jobs import Job, in_passes, repeated
-from keypoint_study.methods import METHODS
-from keypoint_study.sources import UNMASKED, Source, by_name
+from keypoint_study.jobs import Job, Run, repeated
+from keypoint_study.sources import Source
 from thesis_repro import odometry
-from thesis_repro.data.kitti import TRUE_LABELS, Sequence
+from thesis_repro.data.kitti import Sequence
+from thesis_repro.data.layout import layout_of
 from thesis_repro.errors import InputError, cause
-from thesis_repro.masks.folders import LabelMasks, MaskFolder
-from thesis_repro.odometry import THESIS, OdometrySettings
+from thesis_repro.odometry import OdometrySettings
 from thesis_repro.odometry.estimators import COMPARED
 from thesis_repro.odometry.runs import is_flagged, poses_of
 from thesis_repro.running import program, provenance
-from thesis_repro.running.files import listed, progress, write_text
+from thesis_repro.running.code_used import digest_of_code
+from thesis_repro.running.files import progress, write_text
 from thesis_repro.running.workers import open_pool
 
-# rooms whose code decides the poses
-CODE = (
-    "opencv_exact",
-    "thesis_repro.odometry",
-    "thesis_repro.masks",
-    "thesis_repro.running.files",  # reads images
-    "thesis_repro.data",
-    "keypoint_study.controls",
-    "keypoint_study.sources",
-)
-# without what reads poses, and with a table of names, whose entries a run records itself
-WITHOUT = ("thesis_repro.odometry.metrics", "thesis_repro.odometry.estimators")
+# tables whose entries a run may use: its record has the code of those that it used
+TABLES = ("thesis_repro.data.layout.LAYOUTS",)
 SETTINGS = "settings.json"  # of the runs in a folder
+# Passes for each of several workers. Every pass decodes and tracks anew: a sequence on two workers
+# takes 13 % more CPU time than in one pass, and with 4 pieces 35 %.
+PIECES = 2
 
 
 @dataclass(frozen=True)
 class Outcome:
     """What `run_all` did.
 
-    table: all runs that succeeded, one row a job. made, kept, failed_jobs: numbers of jobs that
-    were run now, that had a result from before, and that failed. warnings: lines that say why they
-    failed.
+    table: all runs that succeeded, one row a job. made: number of jobs that were run now; the
+    others had a result from before. reasons: of the jobs that failed. warnings: lines that say so.
     """
 
     table: pd.DataFrame
     made: int
-    kept: int
-    failed_jobs: int
+    reasons: dict[Job, str]
     warnings: list[str]
 
+    @property
+    def kept(self) -> int:
+        """Number of runs that had a result from before."""
+        return len(self.table) - self.made
 
-def _file(folder: Path, job: Job) -> Path:
-    """Return the result file of a job, which is written when the job is done."""
-    return folder / job.sequence / f"{job.name}.csv"
+    @property
+    def failed_jobs(self) -> int:
+        """Number of jobs that failed."""
+        return len(self.reasons)
 
-
-Run: TypeAlias = tuple[Sequence, OdometrySettings, Any]
+    def after(self, first: "Outcome") -> "Outcome":
+        """Return the outcome of both calls, of which this one had the runs of the first, too."""
+        return Outcome(
+            self.table,
+            self.made + first.made,
+            first.reasons | self.reasons,
+            first.warnings + self.warnings,
+        )
 
 
 def run_all(
-    runs: Mapping[Job, Run],
+    runs: Mapping[Job, Run | str],
     folder: Path,
     *,
-    made_from: Mapping[str, Mapping[str, Any]] = {},
-    failed: Mapping[Job, str] = {},
+    inputs: Mapping[str, Mapping[str, Any]] = {},
     processes: int = 1,
     scheduler: str | None = None,
 ) -> Outcome:
     """Run what has no result yet; returns the table of all runs and how many ran.
 
-    runs: {job: (sequence, settings, masks)}. masks: None, `Masks`, or an object with a function
-    `run(sequence, settings)` in place of the odometry.
-    folder: for the results, one file a run. Results from other data or code in it are moved aside,
-    and runs with other settings are made again. made_from: what the masks of a sequence come from,
-    {sequence: inputs} or {sequence/source: inputs}, see `provenance.stage`. failed: reasons of jobs
-    that cannot run.
+    runs: {job: (sequence, settings, masks)}, or the reason why a job cannot run. masks: None,
+    `Masks`, or an object with a function `run(sequence, settings)` in place of the odometry. What
+    has `record()` and `paths` tells its settings and the files that it reads.
+    folder: for the results, one file a run. Results of another sequence or odometry in it are moved
+    aside; runs with other settings, masks or code of these are made again. inputs: what the results
+    of a sequence come from beside, by name.
     processes, scheduler: see `workers.open_pool`; the results do not depend on them. The workers of
     a scheduler need this package, and all folders under the same paths. One thread a worker is
     best.
@@ -101,105 +101,203 @@ def run_all(
     Raises InputError if another process is using the folder, if all runs fail, or if a worker is
     lost.
     """
-    sequences = {sequence.name: sequence for sequence, _, _ in runs.values()}
-    total, reasons = len(runs) + len(failed), dict(failed)
+    reasons = {job: run for job, run in runs.items() if isinstance(run, str)}
+    possible = {job: run for job, run in runs.items() if not isinstance(run, str)}
+    sequences = {run.sequence.name: run.sequence for run in possible.values()}
     with provenance.claimed(folder):
-        for sequence in sequences.values():
-            _stage(folder, sequence, made_from)
-            _drop_changed(runs, folder / sequence.name)
-        waiting = {job: run for job, run in runs.items() if not _file(folder, job).is_file()}
+        for name, sequence in sequences.items():
+            _stage(folder / name, sequence, inputs.get(name, {}))
+        _drop_changed(possible, folder)
+        waiting = {job: run for job, run in possible.items() if not _file(folder, job).is_file()}
         with open_pool(processes, scheduler) as pool:
-            calls = []
-            for jobs in in_passes(waiting, sequences, pool.size):
-                sequence = sequences[jobs[0].sequence]
-                record = provenance.record(folder / sequence.name)
-                calls.append(({job: waiting[job][1:] for job in jobs}, sequence, folder, record))
-            frames = [len(pass_runs) * len(sequence) for pass_runs, sequence, *_ in calls]
+            calls = [
+                (of_pass, folder, _seen(of_pass, folder))
+                for of_pass in _in_passes(waiting, pool.size)
+            ]
+            frames = [sum(len(run.sequence) for run in of_pass.values()) for of_pass, *_ in calls]
             with progress(None, "odometry", total=sum(frames), unit="frame") as bar:
-                for count, of_pass in zip(frames, pool.run(_run_pass, calls), strict=True):
-                    reasons |= of_pass
+                for count, failed in zip(frames, pool.run(_run_pass, calls), strict=True):
+                    reasons |= failed
                     bar.update(count)
     warnings = _report(reasons)
     rows = []
-    for job, (sequence, _, _) in runs.items():
+    for job, run in possible.items():
         path = _file(folder, job)
         if path.is_file():
-            numbers = _measures(path, path.stat().st_mtime_ns, sequence)
+            numbers = _measures(path, path.stat().st_mtime_ns, run.sequence)
             rows.append({"sequence": job.sequence, "run": job.name, **asdict(job), **numbers})
     if not rows:
         first = next(iter(reasons.values()))
-        raise InputError(f"all {total} odometry runs failed; the first: {first}")
-    kept = len(runs) - len(waiting)
-    return Outcome(pd.DataFrame(rows), len(rows) - kept, kept, total - len(rows), warnings)
+        raise InputError(f"all {len(runs)} odometry runs failed; the first: {first}")
+    made = sum(_file(folder, job).is_file() for job in waiting)
+    return Outcome(pd.DataFrame(rows), made, reasons, warnings)
 
 
-def run_jobs(
-    jobs: Iterable[Job],
-    sequences: Iterable[Sequence],
-    sources: Path | Iterable[Source],
-    folder: Path,
-    *,
-    scale_gate: float = THESIS.scale_gate,
-    masked_settings: Mapping[str, Any] = {},
-    **workers: Any,
-) -> Outcome:
-    """Run the jobs of a study that have no result yet, see `run_all`.
+def _file(folder: Path, job: Job) -> Path:
+    """Return the result file of a job, which is written when the job is done."""
+    return folder / job.sequence / f"{job.name}.csv"
 
-    sequences: those of the jobs. sources: folder with one folder of label maps a sequence, or the
-    sources of the jobs. scale_gate: metres, of all runs, see OdometrySettings. masked_settings:
-    other settings of the runs with masks.
+
+def _stage(folder: Path, sequence: Sequence, inputs: Mapping[str, Any]) -> None:
+    """Move aside the results of another sequence, or of another odometry."""
+    if not sequence.has_truth:
+        raise InputError(
+            f"{sequence.poses_path}: no such file; without ground truth, sequence {sequence.name} has no "
+            "errors to compare; leave it out (the odometry command runs it)"
+        )
+    provenance.stage(folder, **_versions(sequence), sequence=sequence.digest(), **inputs)
+
+
+def _versions(sequence: Sequence, *used: Any) -> dict[str, Any]:
+    """Return what the runs over a sequence depend on beside data: code, and other packages."""
+    return {
+        "code": digest_of_code(_made, *reader_of(sequence), *used, without=TABLES),
+        **provenance.versions("opencv", "numpy", "numba"),
+    }
+
+
+def reader_of(sequence: Any) -> list[Any]:
+    """Return what reads a sequence: its class and, if it is in a folder, the layout of this."""
+    folder = getattr(sequence, "folder", None)
+    return [type(sequence), *([layout_of(folder)] if folder else [])]
+
+
+def record_of(settings: OdometrySettings, masks: Any, digest: Callable) -> dict[str, Any]:
+    """Return what a run or the worth of a choice depends on beside its sequence.
+
+    digest: `provenance.digest_of_files`, which may remember.
     """
-    jobs = list(dict.fromkeys(jobs))
-    sources_by_name = by_name(sources)
-    names = {job.sequence for job in jobs}
-    opened = {sequence.name: sequence for sequence in sequences if sequence.name in names}
-    made_from: dict[str, dict[str, Any]] = {}
-    for name, sequence in opened.items():
-        true_maps = listed(sequence.folder / TRUE_LABELS)
-        made_from[name] = {"true_labels": provenance.digest_of_files(true_maps)}
-        for source in sources_by_name.values():
-            place = f"{name}/{source.name}" if source.name else name
-            made_from.setdefault(place, {}).update(source.record(name))
+    return {
+        **settings.record(),
+        "masks": masks.record() if hasattr(masks, "record") else None,
+        "files": digest(tuple(dict.fromkeys(getattr(masks, "paths", ())))),
+        "code": digest_of_code(settings.detector, settings.estimator, masks, without=TABLES),
+    }
 
-    runs, failed = chosen(jobs, opened, sources_by_name)
+
+def _drop_changed(runs: Mapping[Job, Run], folder: Path) -> None:
+    """Delete the results of runs that were made with other settings, masks or code of these."""
+    digest = cache(provenance.digest_of_files)
+    known: dict[Any, Any] = {}  # of runs that differ in numbers alone
+    now: dict[str, dict[str, Any]] = {}
     for job, (sequence, settings, masks) in runs.items():
-        settings = replace(settings, scale_gate=scale_gate)
-        if masks is not None and job.method not in UNMASKED:
-            settings = replace(settings, **masked_settings)
-        runs[job] = sequence, settings, masks
-    return run_all(runs, folder, made_from=made_from, failed=failed, **workers)
+        key = id(settings.detector), id(settings.estimator), id(masks)
+        if key not in known:
+            known[key] = record_of(settings, masks, digest)
+        record = {**known[key], **settings.record()}
+        now.setdefault(sequence.name, {})[job.name] = json.loads(
+            json.dumps(record, default=float)
+        )  # of numpy
+    for name, records in now.items():
+        path = folder / name / SETTINGS
+        before = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+        for run, record in records.items():
+            if before.get(run, record) != record:
+                (folder / name / f"{run}.csv").unlink(missing_ok=True)
+        if before | records != before:
+            write_text(path, json.dumps(before | records, indent=1))
 
 
-def chosen(
-    jobs: Iterable[Job], sequences: Mapping[str, Sequence], sources: Mapping[str, Source]
-) -> tuple[dict[Job, Run], dict[Job, str]]:
-    """Return {job: run} for `run_all`, and {job: reason} for masks that cannot be made.
+def _in_passes(runs: Mapping[Job, Run], workers: int) -> list[dict[Job, Run]]:
+    """Divide runs into parts, each for one pass over a sequence.
 
-    Jobs with the same masks get the same object, by which `run_many` recognises that they share
-    work.
+    Each of several workers gets about PIECES passes, so that all end at about the same time. Runs
+    with the same keypoints stay in one pass, where they share most of their work. A single worker
+    gets one pass a sequence. What runs in place of the odometry shares nothing.
     """
+    passes: list[dict[Job, Run]] = []
+    groups: dict[str, dict[Any, dict[Job, Run]]] = {}  # of the same keypoints, by sequence
+    for job, run in runs.items():
+        if hasattr(run.masks, "run"):
+            passes.append({job: run})
+            continue
+        keypoints = id(run.masks), *run.settings.detection_values()
+        groups.setdefault(job.sequence, {}).setdefault(keypoints, {})[job] = run
+    lengths = {job.sequence: len(run.sequence) for job, run in runs.items()}
+    # work is measured in frames, of which a group of runs reads each once
+    work = sum(lengths[name] * len(of_sequence) for name, of_sequence in groups.items())
+    for name, by_keypoints in groups.items():
+        of_sequence = list(by_keypoints.values())
+        size = len(of_sequence)
+        if workers > 1:
+            size = max(1, round(work / (PIECES * workers) / lengths[name]))
+        for start in range(0, len(of_sequence), size):
+            parts = (group.items() for group in of_sequence[start : start + size])
+            passes.append(dict(chain(*parts)))
+    return passes
 
-    @cache
-    def choose(method: str, sequence: str, source: str, width: int | None) -> Any:
+
+def _seen(runs: Mapping[Job, Run], folder: Path) -> dict[str, Any]:
+    """Return what a worker must see as the main process does: records, code and packages."""
+    ((sequence, _, _), *_) = runs.values()
+    used = chain(
+        *((run.settings.detector, run.settings.estimator, run.masks) for run in runs.values())
+    )
+    record = provenance.record(folder / sequence.name)
+    return {"record": record, **_versions(sequence, *used)}
+
+
+def _run_pass(runs: dict[Job, Run], folder: Path, seen: dict[str, Any]) -> dict[Job, str]:
+    """Make runs over one sequence in one pass, here or on another machine.
+
+    seen: see `_seen`. Returns the reasons of the jobs that failed.
+    """
+    reasons: dict[Job, str] = {}
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)  # the processes already use every core
+    try:
+        if _seen(runs, folder) != seen:
+            raise InputError(
+                f"{folder}: this worker sees other files there, or has other code or versions of packages; "
+                "give all workers the same folders under the same paths and the same packages"
+            )
+        for job, result in _made(runs).items():
+            if isinstance(result, str):
+                reasons[job] = result
+            else:
+                write_text(_file(folder, job), result.frames.to_csv(index=False))
+    except Exception as error:
+        unfinished = [job for job in runs if not _file(folder, job).is_file()]
+        reasons = dict.fromkeys(unfinished, cause(error)) | reasons
+    finally:
+        cv2.setNumThreads(threads)
+    return reasons
+
+
+def _made(runs: Mapping[Job, Run]) -> dict[Job, odometry.Result | str]:
+    """Return the results of runs over one sequence, or the reasons why they failed.
+
+    Every file of masks is read first, because a bad file in the middle would stop the whole pass.
+    """
+    made: dict[Job, odometry.Result | str] = {}
+    together: dict[Job, Any] = {}
+    known: set[Any] = set()
+    for job, (sequence, settings, masks) in runs.items():
         try:
-            given = sources.get(source) or next(iter(sources.values()))
-            return METHODS[method].choose(sequences[sequence], given, width)
+            if hasattr(masks, "check_files"):
+                masks.check_files(known)
         except InputError as error:
-            return str(error)
-
-    runs: dict[Job, Run] = {}
-    reasons = {}
-    for job in jobs:
-        choice = choose(job.method, job.sequence, job.source, job.dilation_width)
-        if isinstance(choice, str):
-            reasons[job] = choice
+            made[job] = str(error)
+            continue
+        if hasattr(masks, "run"):
+            made[job] = masks.run(sequence, settings)
         else:
-            settings, masks = choice
-            runs[job] = sequences[job.sequence], job.changed(settings), masks
-    return runs, reasons
+            together[job] = settings, masks
+    if together:
+        made |= odometry.run_many(sequence, together)
+    for job, result in list(made.items()):
+        # without keypoints, the path is a point, whatever the method
+        if isinstance(result, str) or job.method == "paths":
+            continue
+        if result.frames["detected"].isna().all():
+            made[job] = (
+                f"{sequence.folder}: no frame has any structure (all are black, white or of one "
+                "gray); check how they were written"
+            )
+    return made
 
 
-@cache  # a study calls `run_jobs` again, with more jobs
+@cache  # a study calls `run_all` again, with more jobs
 def _measures(path: Path, changed: int, sequence: Sequence) -> dict[str, Any]:
     """Return what a table of runs has from the file of a run: errors, keypoints, flagged frames.
 
@@ -214,6 +312,19 @@ def _measures(path: Path, changed: int, sequence: Sequence) -> dict[str, Any]:
         "mean_keypoints": frames["detected"].mean(),
         "flagged": int(is_flagged(frames).sum()),
     }
+
+
+def _report(reasons: Mapping[Job, str]) -> list[str]:
+    """Print and return one line for the failed runs of a sequence that have the same reason."""
+    by_reason: dict[tuple[str, str], list[str]] = {}
+    for job, reason in reasons.items():
+        by_reason.setdefault((job.sequence, reason), []).append(job.name)
+    lines = []
+    for (name, reason), runs in by_reason.items():
+        shown = textwrap.shorten(", ".join(runs), 80, placeholder=" ...")
+        lines.append(f"sequence {name}, {shown}: failed: {reason}")
+        program.log.warning(lines[-1])
+    return lines
 
 
 def keypoint_controls(
@@ -244,123 +355,6 @@ def keypoint_controls(
             spread = replace(job, method="spread", min_distance=min_distance(sequence, number))
             jobs += repeated([fewer, spread], estimators, repetitions)
     return jobs
-
-
-def _report(reasons: Mapping[Job, str]) -> list[str]:
-    """Print and return one line for the failed runs of a sequence that have the same reason."""
-    by_reason: dict[tuple[str, str], list[str]] = {}
-    for job, reason in reasons.items():
-        by_reason.setdefault((job.sequence, reason), []).append(job.name)
-    lines = []
-    for (name, reason), runs in by_reason.items():
-        shown = textwrap.shorten(", ".join(runs), 80, placeholder=" ...")
-        lines.append(f"sequence {name}, {shown}: failed: {reason}")
-        program.log.warning(lines[-1])
-    return lines
-
-
-def _stage(folder: Path, sequence: Sequence, made_from: Mapping[str, Mapping[str, Any]]) -> None:
-    """Move aside the results of a sequence that were made from other data or code.
-
-    Each source has a subfolder, so a change of one source does not move the runs of other
-    sources.
-    """
-    if not sequence.has_truth:
-        raise InputError(
-            f"{sequence.poses_path}: no such file; without ground truth, sequence {sequence.name} has no "
-            "errors to compare; leave it out (the odometry command runs it)"
-        )
-    provenance.stage(
-        folder / sequence.name,
-        **_versions(),
-        sequence=sequence.digest(),
-        **made_from.get(sequence.name, {}),
-    )
-    for place, inputs in made_from.items():
-        if place.startswith(f"{sequence.name}/"):
-            provenance.stage(folder / place, **inputs)
-
-
-def _drop_changed(runs: Mapping[Job, Run], folder: Path) -> None:
-    """Delete the results of runs of a sequence that were made with other settings or masks."""
-    now = {
-        job.name: {**settings.record(), "code": _code(settings.estimator), "masks": _record(masks)}
-        for job, (_, settings, masks) in runs.items()
-        if job.sequence == folder.name
-    }
-    now = json.loads(json.dumps(now, default=float))  # numbers of numpy
-    path = folder / SETTINGS
-    before = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
-    for name, settings in now.items():
-        if before.get(name, settings) != settings:
-            (folder / f"{name}.csv").unlink(missing_ok=True)
-    if before | now != before:
-        write_text(path, json.dumps(before | now, indent=1))
-
-
-def _record(masks: Any) -> Any:
-    return masks.record() if isinstance(masks, LabelMasks | MaskFolder | OtherFrame) else None
-
-
-def _code(estimator: Any) -> str:
-    """Return the code of an estimator, which a person may have added to the table of names."""
-    parts = inspect.getmro(estimator) if inspect.isclass(estimator) else [estimator]
-    code = ""
-    for part in parts:
-        # the thesis's (None), what is Python's own, and what was typed into a console have none
-        with suppress(OSError, TypeError):
-            code += inspect.getsource(part)
-    return code
-
-
-def _versions() -> dict[str, Any]:
-    return {
-        "code": provenance.digest_of_code(*CODE, without=WITHOUT),
-        **provenance.made_with("opencv", "numpy", "numba"),
-    }
-
-
-def _run_pass(
-    runs: dict[Job, tuple[OdometrySettings, Any]], sequence: Sequence, folder: Path, record: dict
-) -> dict[Job, str]:
-    """Make runs over one sequence in one pass, here or on another machine.
-
-    Every file of masks is read first, because a bad file in the middle would stop the whole pass.
-    record: of the sequence's results, as the main process sees it. Returns the reasons of the jobs
-    that failed.
-    """
-    reasons: dict[Job, str] = {}
-    threads = cv2.getNumThreads()
-    cv2.setNumThreads(1)  # the processes already use every core
-    try:
-        provenance.check_worker(folder / sequence.name, record, **_versions())
-        known: set[Any] = set()
-        for job, (_, masks) in runs.items():
-            try:
-                if hasattr(masks, "check_files"):
-                    masks.check_files(known)
-            except InputError as error:
-                reasons[job] = str(error)
-        good = {job: run for job, run in runs.items() if job not in reasons}
-        brought = {job: run for job, run in good.items() if hasattr(run[1], "run")}
-        made = {job: own.run(sequence, settings) for job, (settings, own) in brought.items()}
-        if rest := {job: run for job, run in good.items() if job not in brought}:
-            made |= odometry.run_many(sequence, rest)
-        for job, result in made.items():
-            # without keypoints, the path is a point, whatever the method
-            if result.frames["detected"].isna().all() and job.method != "paths":
-                reasons[job] = (
-                    f"{sequence.folder}: no frame has any structure (all are black, white or of "
-                    "one gray); check how they were written"
-                )
-            else:
-                write_text(_file(folder, job), result.frames.to_csv(index=False))
-    except Exception as error:  # report any error as the reason, and let other passes run
-        unfinished = [job for job in runs if not _file(folder, job).is_file()]
-        reasons = dict.fromkeys(unfinished, cause(error)) | reasons
-    finally:
-        cv2.setNumThreads(threads)
-    return reasons
 
 
 def run_poses(runs: pd.DataFrame, folder: Path) -> dict[tuple[str, str], np.ndarray]:

@@ -19,8 +19,7 @@ from thesis_repro.errors import InputError, cause
 from thesis_repro.masks import MaskSettings
 from thesis_repro.masks.folders import LabelMasks, MaskFolder, folder_of_sequence, read_mask
 from thesis_repro.odometry import inputs
-from thesis_repro.running import provenance
-from thesis_repro.running.files import images, listed
+from thesis_repro.running.files import images
 
 KINDS = {
     "labels": "label maps",
@@ -73,7 +72,7 @@ class Source:
 
     def file(self, sequence: str) -> Path:
         """Return the file of the keypoints, or of the path of a sequence."""
-        if self.kind == "keypoints":
+        if self.kind == "keypoints" or self.folder.is_file():
             return self.folder
         return self.folder / f"{sequence}.txt"
 
@@ -97,15 +96,14 @@ class Source:
         steps = [odometry.Step(index, pose=pose) for index, pose in enumerate(brought)]
         return odometry.Result(brought, pd.DataFrame([step.row() for step in steps]))
 
-    def record(self, sequence: str) -> dict[str, str]:
-        """Return the digests and settings that the results of a sequence depend on."""
-        if self.kind in UNMASKED:
-            return {self.kind: provenance.digest_of_file(self.file(sequence))}
-        digest = provenance.digest_of_files(listed(folder_of_sequence(self.folder, sequence)))
-        if self.has_label_maps:
-            settings = {"settings": str(self.settings), **label_ids.record(self.settings.ids)}
-            return {self.kind: digest, **settings}
-        return {self.kind: digest, "invert": str(self.invert)}
+    @property
+    def paths(self) -> list[Path]:
+        """The file of keypoints or of a path, on which the runs depend."""
+        return [self.folder]
+
+    def record(self) -> list[str]:
+        """Return what the runs of keypoints or paths depend on beside files."""
+        return [self.kind]
 
 
 @cache

@@ -49,7 +49,7 @@ which only the error against a ground truth shows. The worth holds for its numbe
 keypoints there are, the more of what they tell they share.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import replace
 from functools import cache, partial
 from itertools import product
@@ -62,8 +62,8 @@ import pandas as pd
 
 import opencv_exact
 from keypoint_study import compare, jobs
-from keypoint_study.methods import METHODS
-from keypoint_study.runner import CODE
+from keypoint_study.methods import METHODS, changed
+from keypoint_study.runner import TABLES, reader_of, record_of
 from keypoint_study.sources import UNMASKED, Source, own_calls
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError, cause
@@ -81,7 +81,8 @@ from thesis_repro.odometry.loop import MIN_MATCHES, normalise
 from thesis_repro.odometry.refined.fit import fit, smaller_rotation
 from thesis_repro.odometry.runs import check, inside
 from thesis_repro.odometry.sharing import SharedCalls
-from thesis_repro.running import provenance
+from thesis_repro.running import program, provenance
+from thesis_repro.running.code_used import digest_of_code
 from thesis_repro.running.files import progress
 from thesis_repro.running.workers import open_pool
 
@@ -114,12 +115,12 @@ class Tracks(NamedTuple):
 
 def worth(
     sequence: Sequence,
-    choices: Choices,
+    chosen: Choices,
     calls: Mapping[str, Calls] = {},
 ) -> pd.DataFrame:
     """Return what a keypoint of each choice is worth on a sequence, by the rule above.
 
-    choices: {(name, number): (settings, masks)}, as for `odometry.run_many`; so many keypoints are
+    chosen: {(name, number): (settings, masks)}, as for `odometry.run_many`; so many keypoints are
     drawn from those that the settings and the masks leave, 0 for all of them. calls: of choices
     with own keypoints, by name.
 
@@ -128,7 +129,7 @@ def worth(
     direction_deg, the median angle between two halves.
     Raises InputError if no step is long enough, and for frames or masks that cannot be read.
     """
-    for _, masks in choices.values():
+    for _, masks in chosen.values():
         check(sequence, masks)
     steps = np.flatnonzero(sequence.scales[1:] >= metrics.MIN_DIRECTED_STEP)
     if not len(steps):
@@ -141,9 +142,9 @@ def worth(
     shared = SharedCalls()
     rows = []
     for index in progress(steps, f"worth of keypoints, {sequence.name}"):
-        random, chosen = tracked(sequence, int(index), choices, shared, calls)
+        random, of_choices = tracked(sequence, int(index), chosen, shared, calls)
         halves_of_random = cache(partial(_halves, random))
-        for (name, number), tracks in chosen.items():
+        for (name, number), tracks in of_choices.items():
             count = min(number or len(tracks.points), len(tracks.points))
             for split, repeat in product(SPLIT, range(SPLITS)):
                 halves = _halves(tracks, count, split, (SEED, index, repeat, 0))
@@ -164,7 +165,7 @@ def worth(
 def tracked(
     sequence: Sequence,
     index: int,
-    choices: Choices,
+    chosen: Choices,
     shared: SharedCalls,
     calls: Mapping[str, Calls],
 ) -> tuple[Tracks, dict[tuple[str, int], Tracks]]:
@@ -172,8 +173,8 @@ def tracked(
     frame, following = sequence.frame(index), sequence.frame(index + 1)
     frame.setflags(write=False)  # so that all choices share it
     visible = sequence.visible(index)
-    made = {id(masks): masks[index] for _, masks in choices.values() if masks is not None}
-    everything = {_RANDOM: (THESIS, None), **choices}
+    made = {id(masks): masks[index] for _, masks in chosen.values() if masks is not None}
+    everything = {_RANDOM: (THESIS, None), **chosen}
     points = {}
     for key, (settings, masks) in everything.items():
         detect = calls.get(key[0], shared.calls).detect
@@ -181,14 +182,14 @@ def tracked(
     # those of all choices, at once
     shared.expect(following, [SimpleNamespace(points=p, previous=frame) for p in points.values()])
     tracks = {}
-    for key, chosen in points.items():
+    for key, detected in points.items():
         settings, _ = everything[key]
-        moved, found = chosen, np.zeros(0, bool)
-        if len(chosen):
+        moved, found = detected, np.zeros(0, bool)
+        if len(detected):
             track = calls.get(key[0], shared.calls).track
-            moved, found = track(frame, following, chosen, settings)
-        before, now = (normalise(pixels, sequence.intrinsics) for pixels in (chosen, moved))
-        tracks[key] = Tracks(chosen, before, now, found, settings.threshold)
+            moved, found = track(frame, following, detected, settings)
+        before, now = (normalise(pixels, sequence.intrinsics) for pixels in (detected, moved))
+        tracks[key] = Tracks(detected, before, now, found, settings.threshold)
     return tracks.pop(_RANDOM), tracks
 
 
@@ -258,23 +259,24 @@ def choices(
     number: int,
     with_controls: bool = True,
     masked_settings: Mapping[str, Any] = {},
-) -> tuple[Choices, dict[str, Calls]]:
-    """Return the choices of a study and the calls of own keypoints, as `worth` takes them.
+    named: Collection[str] = (),
+) -> tuple[Choices, dict[str, Path]]:
+    """Return the choices of a study, as `worth` takes them, and the files of own keypoints by name.
 
     Keypoints of every source, and without it random, spread and the strongest ones. number: see
     `worth`; only for all of a choice (0), there are no spread and strongest ones. with_controls:
-    also masks that are filled, and all `methods.MASK_CONTROLS` that a source allows.
+    also masks that are filled, and the controls of `jobs.mask_controls`; named: see there.
     """
-    masked = replace(THESIS, **masked_settings)
     chosen: dict[str, tuple] = {"random keypoints": (THESIS, None)}
-    calls = {}
+    own = {}
     if number:
         chosen["spread keypoints"] = replace(THESIS, detector=spread(number)), None
         chosen["strongest keypoints"] = replace(THESIS, max_keypoints=number), None
+    masked = replace(THESIS, **masked_settings)
     for source in sources:
         prefix = f"{source.name}: " if source.name else ""
         if source.kind == "keypoints":
-            calls[source.name] = own_calls(source.folder)
+            own[source.name] = source.folder
             chosen[source.name] = THESIS, None
         if source.kind in UNMASKED:
             continue
@@ -285,10 +287,11 @@ def choices(
         if with_controls:
             more = filled(FILL, masked.detector)
             chosen[f"{prefix}masks, filled"] = replace(masked, detector=more), masks
-            for name, width_of_control in jobs.mask_controls(source, sequence, width).items():
-                _, control = METHODS[name].choose(sequence, source, width_of_control)
-                chosen[prefix + METHODS[name].title] = masked, control
-    return {(name, number): choice for name, choice in chosen.items()}, calls
+            controls = jobs.mask_controls(source, sequence, width, named)
+            for name, width_of_control in controls.items():
+                settings, control = METHODS[name].choose(sequence, source, width_of_control)
+                chosen[prefix + METHODS[name].title] = changed(settings, masked_settings), control
+    return {(name, number): choice for name, choice in chosen.items()}, own
 
 
 def measure(
@@ -304,53 +307,46 @@ def measure(
     """Return the table of `worth` for the `choices` of sources; what is in the folder is kept.
 
     width: pixels, of masks from label maps. processes, scheduler: see `workers.open_pool`.
-    options: of `choices`.
+    options: of `choices`. A sequence without a result is left out with a warning. Raises InputError
+    if none has one.
     """
     sources, numbers = list(sources), list(numbers)
-    code = provenance.digest_of_code(
-        *CODE,
-        "keypoint_study.methods",
-        "keypoint_study.worth",
-        without=("thesis_repro.odometry.estimators",),  # all motions are refined ones
-    )
+    digest = cache(provenance.digest_of_files)
     calls: list[tuple] = []
     for sequence in sequences:
+        deciding, own = choices(sequence, sources, width, DECIDING, **options)
         stage = provenance.stage(
             folder / sequence.name,
-            sequence=provenance.digest_of_files(sequence.files),
-            sources=[source.record(sequence.name) for source in sources],
-            width=width,
-            options=options,
-            code=code,
-            **provenance.made_with("opencv", "numpy", "numba"),
+            sequence=sequence.digest(),
+            choices={name: record_of(*choice, digest) for (name, _), choice in deciding.items()},
+            own={name: digest((file,)) for name, file in own.items()},
+            code=digest_of_code(_measure_one, *reader_of(sequence), without=TABLES),
+            **provenance.versions("opencv", "numpy", "numba"),
         )
-        calls += [
-            (stage / f"{number}.csv", sequence, sources, width, number, options)
-            for number in numbers
-        ]
+        for number in numbers:
+            chosen, _ = choices(sequence, sources, width, number, **options)
+            calls.append((stage / f"{number}.csv", sequence, chosen, own))
+    missing = [call for call in calls if not call[0].is_file()]
     with open_pool(processes, scheduler) as pool:
-        for _ in pool.run(_measure_one, [call for call in calls if not call[0].is_file()]):
-            pass
-    tables = [pd.read_csv(file, dtype={"sequence": str}) for file, *_ in calls]
+        reasons = list(filter(None, pool.run(_measure_one, missing)))
+    tables = [pd.read_csv(file, dtype={"sequence": str}) for file, *_ in calls if file.is_file()]
+    if not tables:
+        raise InputError(reasons[0])
+    for reason in reasons:
+        program.log.warning(f"{reason}; it has no worth of keypoints")
     return pd.concat(tables, ignore_index=True)
 
 
-def _measure_one(
-    file: Path,
-    sequence: Sequence,
-    sources: Iterable[Source],
-    width: int | None,
-    number: int,
-    options: Mapping[str, Any],
-) -> None:
-    chosen, calls = choices(sequence, sources, width, number, **options)
+def _measure_one(file: Path, sequence: Sequence, chosen: Choices, own: Mapping[str, Path]) -> str:
+    """Write the table of `worth`; return the reason if there is none."""
     try:
-        table = worth(sequence, chosen, calls)
-    except InputError:
-        raise
+        table = worth(sequence, chosen, {name: own_calls(path) for name, path in own.items()})
+    except InputError as error:
+        return str(error)
     except Exception as error:  # of own keypoints
-        raise InputError(f"{sequence.folder}: {cause(error)}") from error
+        return f"{sequence.folder}: {cause(error)}"
     provenance.write_table(file, table)
+    return ""
 
 
 # Over several streets

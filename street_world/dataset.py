@@ -18,6 +18,7 @@ from joblib import cpu_count as cores
 from street_world import drives, street, textures
 from thesis_repro.data import kitti, trajectories
 from thesis_repro.running import provenance
+from thesis_repro.running.code_used import digest_of_code
 from thesis_repro.running.files import progress, write_png, write_text
 from thesis_repro.running.workers import open_pool
 
@@ -172,7 +173,10 @@ def write(
     }
     with provenance.claimed(out):
         provenance.stage(
-            out, replace=replace, code=provenance.digest_of_code("street_world"), **parameters
+            out,
+            replace=replace,
+            code=digest_of_code(_pictures, _write_missing, _write_sequence_texts),
+            **parameters,
         )
         pictures = []
         for picture in _pictures(out, **parameters):

@@ -1,4 +1,4 @@
-"""Made-up paths, and runs with made-up errors, as `runner.run_jobs` gives them."""
+"""Made-up paths, and runs with made-up errors, as `runner.run_all` gives them."""
 
 from itertools import product
 

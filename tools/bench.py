@@ -120,11 +120,10 @@ def mask_cost(sequence, labels):
     The masks are those of all widths and methods.
     """
     source, costs = Source(labels), np.zeros(2)
-    kinds = [source.masks(sequence, width) for width in WIDTHS] + [
-        methods.METHODS[method].choose(sequence, source, controls.LINE_WIDTH)[1]
-        for method in methods.MASK_CONTROLS
-        if method != "true-labels"
-    ]
+    kinds = [source.masks(sequence, width) for width in WIDTHS]
+    for name in set(methods.MASK_CONTROLS) - {"true-labels"}:
+        _, control = methods.METHODS[name].choose(sequence, source, controls.LINE_WIDTH)
+        kinds += [control] * (control is not None)  # a method may have settings alone
     for index in range(len(sequence)):
         for column, forget in enumerate((lambda: None, folders.forget_edges)):
             folders.forget_edges()

@@ -146,7 +146,9 @@ def runs_of_widths(settings, sequences, labels):
         for method, width in kinds
     ]
     folder = settings.build / "refined_widths"
-    return runner.run_jobs(planned, sequences, labels, folder, processes=settings.jobs).table
+    return runner.run_all(
+        jobs.runs_of(planned, sequences, labels), folder, processes=settings.jobs
+    ).table
 
 
 def table_of_widths(runs):

@@ -24,6 +24,7 @@ from keras import ops
 from street_world import dataset as world
 from thesis_repro.data import cityscapes
 from thesis_repro.running import files, program, provenance
+from thesis_repro.running.code_used import digest_of_code
 from thesis_repro.segmentation import augmentation, prediction, quality, training
 from thesis_repro.segmentation.unet import build_unet
 
@@ -217,9 +218,9 @@ def train(camvid, kitti_semantic, pseudo, folder):
     )
     optimizer.build(model.trainable_variables)
     made_from = {
-        "code": provenance.digest_of_code("thesis_repro.segmentation.unet"),
+        "code": digest_of_code(build_unet),
         "tool": provenance.digest_of_file(Path(__file__)),
-        **provenance.made_with("tensorflow", "keras"),
+        **provenance.versions("tensorflow", "keras"),
         "phases": [COMMON, LAST],
         "steps": EPOCH,
         "images": provenance.digest_of_files(

@@ -114,13 +114,13 @@ def run(settings, sources):
         sources=sources,
         repetitions=repetitions,
     )
-    needed = [job for job in first if is_needed(job)]
-    outcome = runner.run_jobs(needed, sequences, sources, folder, processes=settings.jobs)
-    needed += runner.keypoint_controls(
-        outcome.table, sequences, sources, repetitions, jobs.CONTROL_WIDTH, [DECIDING]
+    runs = jobs.runs_of(filter(is_needed, first), sequences, sources)
+    table = runner.run_all(runs, folder, processes=settings.jobs).table
+    more = runner.keypoint_controls(
+        table, sequences, sources, repetitions, jobs.CONTROL_WIDTH, [DECIDING]
     )
-    outcome = runner.run_jobs(needed, sequences, sources, folder, processes=settings.jobs)
-    return outcome.table
+    runs |= jobs.runs_of(more, sequences, sources)
+    return runner.run_all(runs, folder, processes=settings.jobs).table
 
 
 def is_needed(job):

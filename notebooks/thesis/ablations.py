@@ -15,9 +15,9 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from keypoint_study.jobs import CONTROL_WIDTH, Job
-from keypoint_study.methods import Choice
-from keypoint_study.runner import Run, run_all, run_poses
+from keypoint_study.jobs import CONTROL_WIDTH, Job, Run
+from keypoint_study.methods import Choice, changed
+from keypoint_study.runner import run_all, run_poses
 from thesis_repro import masks
 from thesis_repro.data.cityscapes import ID, read_label_map, resize_bilinear
 from thesis_repro.data.kitti import Sequence
@@ -137,11 +137,11 @@ def run_choices(
     than 0 is the seed that shuffles the matched points. The estimator "inliers" is run for all
     keypoints and masks alone.
     """
-    runs: dict[Job, Run] = {}
-    made_from = {}
+    runs: dict[Job, Run | str] = {}
+    inputs = {}
     for sequence in sequences:
         maps = [labels / sequence.name / path.name for path in sequence.frame_paths]
-        made_from[sequence.name] = {
+        inputs[sequence.name] = {
             "choices": provenance.digest_of_file(code),
             "labels": provenance.digest_of_files(maps),
         }
@@ -150,8 +150,8 @@ def run_choices(
         ):
             if estimator != "inliers" or method in ("baseline", "masked"):
                 job = Job(sequence.name, method, estimator=estimator, repetition=repetition)
-                runs[job] = sequence, job.changed(settings), given
-    return run_all(runs, folder, made_from=made_from, processes=processes).table
+                runs[job] = Run(sequence, changed(settings, job.changes()), given)
+    return run_all(runs, folder, inputs=inputs, processes=processes).table
 
 
 def run_ablations(

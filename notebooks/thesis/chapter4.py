@@ -2,7 +2,7 @@
 
 `keypoint_study.report.comparison` shows ratios of errors.
 
-Runs are rows of the table of `runner.run_jobs`. Lines and bars show the mean over repetitions, or
+Runs are rows of the table of `runner.run_all`. Lines and bars show the mean over repetitions, or
 the only run. Bands and error bars go from the lowest to the highest repetition.
 """
 

@@ -10,7 +10,7 @@ import pytest
 from trials import ROOT, wait_for
 
 from keypoint_study import runner
-from keypoint_study.jobs import first_jobs
+from keypoint_study.jobs import first_jobs, runs_of
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.running import workers
@@ -72,7 +72,8 @@ def test_a_cluster_gives_the_same_bits_although_a_worker_is_killed(
 ):
     opened = [Sequence(small_world / "kitti", name) for name in ("00", "01")]
     jobs = first_jobs(opened, {"thesis": (5, 15)}, repetitions=2)
-    here = runner.run_jobs(jobs, opened, small_labels, tmp_path / "here")
+    runs = runs_of(jobs, opened, small_labels)
+    here = runner.run_all(runs, tmp_path / "here")
     there = tmp_path / "there"
 
     def kill():
@@ -81,6 +82,6 @@ def test_a_cluster_gives_the_same_bits_although_a_worker_is_killed(
 
     killer = threading.Thread(target=kill)
     killer.start()
-    result = runner.run_jobs(jobs, opened, small_labels, there, scheduler=scheduler)
+    result = runner.run_all(runs, there, scheduler=scheduler)
     killer.join()
     pd.testing.assert_frame_equal(result.table, here.table, check_exact=True)

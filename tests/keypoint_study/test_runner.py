@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 from keypoint_study import compare, methods, runner
-from keypoint_study.jobs import Job, first_jobs
+from keypoint_study.jobs import Job, first_jobs, runs_of
 from keypoint_study.sources import Source
 from thesis import section_4_2, timing
 from thesis_repro import masks, odometry
@@ -18,7 +18,6 @@ from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.masks import folders
 from thesis_repro.odometry import metrics
-from thesis_repro.odometry.estimators import VoteOfInliers
 from thesis_repro.odometry.keypoints import filtered
 from thesis_repro.running import program, workers
 from thesis_repro.segmentation import training
@@ -34,10 +33,11 @@ def opened(world, frames=None):
 def finished(small_world, small_labels, tmp_path_factory):
     folder = tmp_path_factory.mktemp("odometry")
     jobs = first_jobs(opened(small_world), {"thesis": WIDTHS})
-    inputs = {"sequences": opened(small_world), "sources": small_labels, "folder": folder}
-    summary = runner.run_jobs(jobs, **inputs, processes=2).table
+    runs = runs_of(jobs, opened(small_world), small_labels)
+    summary = runner.run_all(runs, folder, processes=2).table
     jobs += section_4_2.reduced_jobs(section_4_2.best_widths(compare.of_method(summary, "masked")))
-    return folder, jobs, runner.run_jobs(jobs, **inputs).table
+    runs = runs_of(jobs, opened(small_world), small_labels)
+    return folder, jobs, runner.run_all(runs, folder).table
 
 
 def test_a_run_equals_the_odometry_of_its_sequence(small_world, small_labels, finished):
@@ -63,7 +63,7 @@ def test_only_missing_runs_are_run_again(small_world, small_labels, finished):
     times = {path: path.stat().st_mtime_ns for path in folder.rglob("*.csv")}
     missing = folder / "00" / "masked-05-0.csv"
     missing.unlink()
-    again = runner.run_jobs(jobs, opened(small_world), small_labels, folder)
+    again = runner.run_all(runs_of(jobs, opened(small_world), small_labels), folder)
     assert [path for path in times if path.stat().st_mtime_ns != times[path]] == [missing]
     pd.testing.assert_frame_equal(again.table, summary)
     assert (again.made, again.kept, again.failed_jobs) == (1, len(jobs) - 1, 0)
@@ -83,11 +83,11 @@ def test_a_stopped_pass_is_repeated_and_ends_as_an_undisturbed_one(
 
     with monkeypatch.context() as patch:
         patch.setattr(Sequence, "frame", frame)
-        outcome = runner.run_jobs(jobs, opened(small_world), small_labels, tmp_path)
+        outcome = runner.run_all(runs_of(jobs, opened(small_world), small_labels), tmp_path)
     assert set(outcome.table["sequence"]) == {"00"} and outcome.failed_jobs == 4
     assert str(error) in outcome.warnings[0]
     times = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.csv")}
-    runner.run_jobs(jobs, opened(small_world), small_labels, tmp_path)
+    runner.run_all(runs_of(jobs, opened(small_world), small_labels), tmp_path)
     assert times == {path: path.stat().st_mtime_ns for path in times} and len(times) == 4
     for job in jobs:
         whole, repeated = (
@@ -110,7 +110,9 @@ def test_a_failed_run_is_reported_and_stops_no_other_run(
         Job("00", "mirrored", 10),
         Job("00", "masked", dilation_width=0),
     ]
-    outcome = runner.run_jobs(jobs, opened(small_world, 5), tmp_path / "labels", tmp_path / "runs")
+    outcome = runner.run_all(
+        runs_of(jobs, opened(small_world, 5), tmp_path / "labels"), tmp_path / "runs"
+    )
     assert (outcome.made, outcome.kept, outcome.failed_jobs) == (2, 0, len(jobs) - 2)
     assert list(outcome.table["run"]) == ["baseline-0", "true-labels-10-0"]
     printed = capsys.readouterr().err
@@ -120,7 +122,7 @@ def test_a_failed_run_is_reported_and_stops_no_other_run(
     )
     assert "sequence 00, masked-00-0: failed: dilation width 0" in printed
     with pytest.raises(InputError, match="all 1 odometry runs failed; the first: dilation width 0"):
-        runner.run_jobs(jobs[-1:], opened(small_world), small_labels, tmp_path / "none")
+        runner.run_all(runs_of(jobs[-1:], opened(small_world), small_labels), tmp_path / "none")
 
 
 def test_a_sequence_without_structure_has_no_result(tiny_kitti, tmp_path):
@@ -130,20 +132,20 @@ def test_a_sequence_without_structure_has_no_result(tiny_kitti, tmp_path):
         cv2.imwrite(str(path), np.full((48, 64), 128, np.uint8))
     sequences = [Sequence(tiny_kitti, name) for name in ("00", "01")]
     jobs = [Job(name, "baseline", repetition=number) for name in ("00", "01") for number in (0, 1)]
-    outcome = runner.run_jobs(jobs, sequences, tmp_path / "none", tmp_path / "runs")
+    outcome = runner.run_all(runs_of(jobs, sequences, tmp_path / "none"), tmp_path / "runs")
     assert (outcome.made, outcome.kept, outcome.failed_jobs) == (2, 0, 2)
     assert set(outcome.table["sequence"]) == {"00"}
     assert len(outcome.warnings) == 1 and "sequence 01, " in outcome.warnings[0]
     with pytest.raises(InputError, match="sequences/01: "):
-        runner.run_jobs(jobs[2:], sequences, tmp_path / "none", tmp_path / "runs")
+        runner.run_all(runs_of(jobs[2:], sequences, tmp_path / "none"), tmp_path / "runs")
 
 
 def test_a_run_with_other_settings_is_made_again_and_no_other(small_world, small_labels, tmp_path):
     jobs = [Job("00", "baseline"), Job("00", "masked", 5)]
-    arguments = jobs, opened(small_world, 4), small_labels, tmp_path
-    first = runner.run_jobs(*arguments)
-    changed = runner.run_jobs(*arguments, masked_settings={"detector": filtered})
-    again = runner.run_jobs(*arguments, masked_settings={"detector": filtered})
+    given = jobs, opened(small_world, 4), small_labels
+    first = runner.run_all(runs_of(*given), tmp_path)
+    runs = runs_of(*given, masked_settings={"detector": filtered})
+    changed, again = runner.run_all(runs, tmp_path), runner.run_all(runs, tmp_path)
     assert [(each.made, each.kept) for each in (first, changed, again)] == [(2, 0), (1, 1), (0, 2)]
     keypoints = [each.table["mean_keypoints"].tolist() for each in (first, changed)]
     assert keypoints[0][0] == keypoints[1][0] and keypoints[0][1] != keypoints[1][1]
@@ -155,8 +157,8 @@ def test_masks_of_static_things_have_no_width_and_their_controls_are_what_they_a
     sequence = opened(small_world, 4)[0]
     source = Source(small_labels, settings=masks.MaskSettings(keep="static"))
     jobs = first_jobs([sequence], {"thesis": ()}, tested=5, sources=[source])
-    runs, failed = runner.chosen(jobs, {"00": sequence}, {"": source})
-    assert not failed and len(runs) == len(jobs)
+    runs = runs_of(jobs, [sequence], [source])
+    assert list(runs) == jobs
     made = {job.method: (job.dilation_width, run[2]) for job, run in runs.items()}
     assert [made[name][0] for name in ("masked", "mirrored")] == [None, None]
     width, exact = made["exact-boundaries"]
@@ -183,9 +185,12 @@ def test_first_jobs_are_complete_and_have_different_names(small_world, tiny_kitt
     assert count["ready", "masked", "refined"] == 2
     assert rows.loc[rows["source"] == "ready", "dilation_width"].isna().all()
     net, ready_made = (set(rows.loc[rows["source"] == name, "method"]) for name in ("net", "ready"))
-    assert net == {"masked", *methods.MASK_CONTROLS} and net - ready_made == set(
-        methods.OF_LABEL_MAPS
-    )
+    # no list names them: what is in the table runs, unless it waits to be asked for
+    groups = {name: method.group for name, method in methods.METHODS.items()}
+    of_labels = {name for name, group in groups.items() if group == methods.LABEL_MAPS}
+    controls = {name for name, group in groups.items() if group == methods.CONTROL}
+    assert net == {"masked", *of_labels, *controls} - {"fewer", "spread"}
+    assert net - ready_made == of_labels
     without_truth = first_jobs([Sequence(tiny_kitti, "00")], {"thesis": (5,)}, tested=5)
     assert "true-labels" not in {job.method for job in without_truth}
 
@@ -233,10 +238,3 @@ def test_a_killed_worker_is_one_line_and_the_next_call_works():
         list(pool.run(signal.raise_signal, [(signal.SIGKILL,)]))
     with workers.open_pool(2) as pool:
         assert list(pool.run(abs, [(-2,), (-1,)])) == [2, 1]
-
-
-def test_an_estimator_is_recorded_with_the_classes_that_it_builds_on():
-    class Own(VoteOfInliers):
-        """Changes nothing."""
-
-    assert "class VoteOfInliers" in runner._code(Own) and "class VoteOfAll" in runner._code(Own)

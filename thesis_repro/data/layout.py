@@ -26,15 +26,16 @@ def files(folder: Path, camera: str | None = None) -> Files:
             f"{folder}: is a file; a sequence is a folder of frames (docs/own-masks.md says how to write "
             "those of a video)"
         )
-    return _layout(folder).files(folder, camera)
+    return layout_of(folder).files(folder, camera)
 
 
 def poses(folder: Path) -> Path:
     """File or folder, perhaps missing, of the poses of the sequence in a folder."""
-    return _layout(folder).poses(folder)
+    return layout_of(folder).poses(folder)
 
 
-def _layout(folder: Path) -> Any:
+def layout_of(folder: Path) -> Any:
+    """Layout of the sequence in a folder. Raises InputError, which lists them, if there is none."""
     for layout in LAYOUTS:
         if layout.is_mine(folder):
             return layout

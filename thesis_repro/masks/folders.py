@@ -14,6 +14,7 @@ from thesis_repro.data.kitti import Sequence, check_size
 from thesis_repro.errors import InputError
 from thesis_repro.masks import THESIS_MASKS, MaskSettings, check_width, forget, keypoint_mask
 from thesis_repro.running import provenance
+from thesis_repro.running.code_used import digest_of_code
 from thesis_repro.running.files import listed, progress, read_gray, write_png
 
 ENDINGS = (".png", ".jpg", ".jpeg")  # of masks, in small or capital letters
@@ -59,7 +60,8 @@ class LabelMasks:
 
     def record(self) -> list[Any]:
         """Return what the masks depend on beside files."""
-        return ["label maps", self.dilation_width, str(self.settings)]
+        table = label_ids.record(self.settings.ids)
+        return ["label maps", self.dilation_width, str(self.settings), table]
 
     def check_files(self, known: set[Any]) -> None:
         """Raise InputError if a label map cannot be read. known: files that can, added to."""
@@ -96,8 +98,8 @@ def write_masks(masks: LabelMasks, folder: str | Path) -> None:
             **label_ids.record(masks.settings.ids),
             dilation_width=masks.dilation_width,
             frames=provenance.digest_of_files(masks.frame_paths),
-            code=provenance.digest_of_code("thesis_repro.masks", "thesis_repro.data"),
-            **provenance.made_with("opencv"),
+            code=digest_of_code(masks),
+            **provenance.versions("opencv"),
         )
         for index, path in enumerate(progress(masks.paths, f"masks, width {masks.dilation_width}")):
             if not (folder / path.name).is_file():

@@ -14,6 +14,7 @@ from collections.abc import Collection, Iterable, Iterator
 from functools import cache, partial
 from importlib.util import find_spec
 from pathlib import Path
+from types import ModuleType
 from typing import Any, NamedTuple
 
 PACKAGES = ("thesis_repro", "keypoint_study", "opencv_exact", "street_world", "thesis")
@@ -34,12 +35,16 @@ class Code(NamedTuple):
     imports: dict[str, Place]
     definitions: dict[str, list[ast.AST]]
 
+    def nodes(self) -> list[ast.AST]:
+        """Return all its statements but imports."""
+        return [node for nodes in self.definitions.values() for node in nodes]
+
 
 def digest_of_code(*used: Any, without: Collection[str] = ()) -> str:
     """Return a digest of the code of what was used.
 
-    used: functions, classes, and objects with what they hold; a text is that of a script. without:
-    definitions that are not followed, "module.name": tables whose entries are in `used`.
+    used: functions, classes, modules, and objects with what they hold; a text is that of a script.
+    without: definitions that are not followed, "module.name": tables whose entries are in `used`.
     """
     texts: set[str] = set()
     known: dict[Any, Any] = {}  # keeps what is known by its identity
@@ -60,18 +65,18 @@ def _of_object(each: Any) -> tuple[str, list[Any]]:
     """Return the text of an object's code, if PACKAGES have it not, and what the object uses."""
     if isinstance(each, partial):
         return "", [each.func, *_held([*each.args, *each.keywords.values()])]
+    if isinstance(each, ModuleType):
+        return "", [Place(each.__name__, WHOLE)]
     if isinstance(each, str):
         script = _code(each)
-        return each, _uses(
-            Place(""), [node for nodes in script.definitions.values() for node in nodes], script
-        )
+        return each, [*script.loads, *_uses(Place(""), script.nodes(), script)]
     name = getattr(each, "__qualname__", "").split(".")[0]
     if not name:
         return "", [type(each), *_held(vars(each).values() if hasattr(each, "__dict__") else ())]
     cells = getattr(each, "__closure__", None) or ()
     held = [cell.cell_contents for cell in cells]
     held += [getattr(each, "__self__", None), *getattr(each, "__bases__", ())]
-    module = getattr(each, "__module__", None)
+    module = str(getattr(each, "__module__", ""))
     if _path(module):
         return "", [Place(module, name), *_held(held)]
     return _text_around(each), _held(held)
@@ -105,15 +110,15 @@ def _of_place(place: Place) -> tuple[str, list[Place]]:
         nodes = code.definitions.get(name, [])
         more = [Place(module)] if name else [Place(module.rpartition(".")[0]), *code.loads]
     else:  # all of it, or a name that is made as the module runs
-        nodes = [node for nodes in code.definitions.values() for node in nodes]
+        nodes = code.nodes()
         more = [Place(module), *code.imports.values()]
     return "\n".join(map(ast.unparse, nodes)), [*more, *_uses(place, nodes, code)]
 
 
 @cache
-def _path(module: str | None) -> Path | None:
+def _path(module: str) -> Path | None:
     """Return the file of a module of PACKAGES; None for what is none."""
-    package, *parts = (module or "").split(".")
+    package, *parts = module.split(".")
     spec = find_spec(package) if package in PACKAGES else None
     if spec is None or spec.origin is None:
         return None

@@ -11,7 +11,6 @@ import os
 import platform
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -93,19 +92,6 @@ def made_from(folder: str | Path) -> str:
     return digest_of_file(Path(folder) / RECORD)
 
 
-def check_worker(folder: str | Path, made_from: dict[str, Any], **here: Any) -> None:
-    """Raise InputError if a worker on another machine sees other files, or has other versions.
-
-    made_from: the record of a stage's folder as the main process sees it. here: inputs as this
-    worker has them, such as package versions.
-    """
-    if record(folder) != made_from or made_from | here != made_from:
-        raise InputError(
-            f"{folder}: this worker sees other files there, or has other versions of packages; give "
-            "all workers the same folders under the same paths and the same packages"
-        )
-
-
 def sweep(folder: str | Path) -> None:
     """Delete the temporary files of killed runs in and below a folder.
 
@@ -160,34 +146,16 @@ def write_table(path: str | Path, table: pd.DataFrame) -> None:
 # Digests
 
 
-@cache
-def digest_of_code(*rooms: str, without: tuple[str, ...] = ()) -> str:
-    """Return a digest of the code that results come from.
-
-    rooms: dotted names of packages ("thesis_repro.odometry", with all that is in it) or modules.
-    without: modules in these packages that results do not depend on. A changed comment changes the
-    digest, too.
-    """
-    left_out = [ROOT.joinpath(*name.split(".")).with_suffix(".py") for name in without]
-    digest = hashlib.sha256()
-    for room in rooms:
-        place = ROOT.joinpath(*room.split("."))
-        paths = sorted(place.rglob("*.py")) or [place.with_suffix(".py")]
-        for path in (path for path in paths if path not in left_out):
-            digest.update(path.read_bytes())
-    return digest.hexdigest()[:12]
-
-
-def made_with(*packages: str) -> dict[str, Any]:
+def versions(*packages: str) -> dict[str, Any]:
     """Return the machine and the versions of packages that results depend on.
 
     "opencv" is any of its four. The machine is "x86_64" or "arm64", say: OpenCV and TensorFlow
     round differently on other architectures.
     """
-    versions = {"opencv": cv2.__version__}
+    found = {"opencv": cv2.__version__}
     for name in set(packages) - {"opencv"}:
-        versions[name] = metadata.version(name)
-    return {"versions": versions, "machine": platform.machine()}
+        found[name] = metadata.version(name)
+    return {"versions": found, "machine": platform.machine()}
 
 
 def digest_of_files(paths: Iterable[str | Path]) -> str:

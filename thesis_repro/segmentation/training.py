@@ -20,6 +20,7 @@ from thesis_repro import segmentation
 from thesis_repro.data.cityscapes import CLASS_WEIGHTS, N_CLASSES
 from thesis_repro.errors import InputError
 from thesis_repro.running import files, program, provenance
+from thesis_repro.running.code_used import digest_of_code
 from thesis_repro.segmentation import augmentation
 from thesis_repro.segmentation.exact import same_bits
 
@@ -171,10 +172,8 @@ def made_from(model: Any, batches: Batches, validation: Batches) -> dict[str, An
     predicted = random.dirichlet(np.ones(N_CLASSES), true.shape[:3]).astype(np.float32)
     arrays = [array for pair in (*batches.sets, *validation.sets) for array in pair]
     return {
-        "code": provenance.digest_of_code(
-            "thesis_repro.segmentation", "thesis_repro.data.cityscapes"
-        ),
-        **provenance.made_with("tensorflow", "keras", "albumentations"),
+        "code": digest_of_code(Batches, ResumableTraining, fused_loss, load_model),
+        **provenance.versions("tensorflow", "keras", "albumentations"),
         "arithmetic": segmentation.arithmetic(),
         "network": zlib.crc32(json.dumps(model.get_config(), default=str).encode()),
         "first_weights": weights_digest(model),
