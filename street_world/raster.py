@@ -22,11 +22,11 @@ reference, which costs more than the arithmetic.
 """
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import numba
 import numpy as np
 
+from opencv_exact.compiling import compiled, inlined
 from thesis_repro.data.cityscapes import ID
 
 # Columns of the face matrix; each row is a face.
@@ -88,14 +88,6 @@ class Environment(NamedTuple):
     shadow: float  # share of the ground's brightness that is left in shadow
     horizon: float  # gray value that distant surfaces fade to
     haze: float  # extinction, 1/m
-
-
-# How loops are compiled. Both kinds divide by zero as numpy does. Functions of the second kind are
-# inlined into those of the first, and Python cannot call them.
-OPTIONS: Any = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
-INLINED: Any = {"forceinline": True, "no_cpython_wrapper": True}
-compiled = numba.njit(cache=True, **OPTIONS)
-inlined = numba.njit(**OPTIONS, **INLINED)
 
 
 # Textures

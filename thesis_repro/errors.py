@@ -82,6 +82,8 @@ def missing_package(error: ImportError | AttributeError) -> InputError | None:
         names = [getattr(error.obj, "__name__", "")]
         if getattr(error.obj, "__file__", None):
             return None
+    if "failed to map segment" in str(error):  # the loader's words
+        return InputError(f"memory ran out, or the disk forbids programs: {error}")
     modules = [name.partition(".")[0] for name in names]
     for module in [module for module in reversed(modules) if module in COMPILED]:
         spec = find_spec(module)

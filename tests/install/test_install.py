@@ -14,6 +14,7 @@ from packaging.requirements import Requirement
 from trials import refused, run, snapshot, succeed
 
 import can_install
+import installed as installed_packages
 from thesis.settings import ROOT
 from thesis_repro.running import provenance
 
@@ -143,8 +144,40 @@ def test_make_reads_settings_from_its_arguments_and_the_environment(checkout):
     planned = succeed([*figures, "-n", "PROFILE=smoke"], checkout)
     assert "thesis.figures" in planned.stdout and snapshot(checkout) == before  # nothing is written
     assert "/embedded-demo/notebooks/01_load" in plan(checkout, THESIS_REPRO_BUILD="other")
-    refused = run([*figures, "EPOCH=3"], checkout)
-    assert refused.returncode == 2 and "error: EPOCH: " in refused.stderr
+
+
+@pytest.mark.parametrize(
+    "target, options, variables, named",
+    [
+        ("figures", ["EPOCH=3"], {}, "EPOCH: "),
+        ("figures", [], {"PROFILE": "smal"}, "PROFILE=smal: "),
+        ("figures", ["BUILD=my results"], {}, "BUILD=my results: "),
+        ("check-data", [], {"KITTI": "/no/such/folder"}, "/no/such/folder"),
+        ("lab", ["PROFILE=labb"], {"CDPATH": "/"}, "PROFILE=labb: "),
+    ],
+)
+def test_a_wrong_setting_is_named_wherever_it_stands(checkout, target, options, variables, named):
+    words = ["make", "-o", ".venv/ready", target, *options]
+    failed = run(words, checkout, **variables)
+    assert failed.returncode == 2 and f"error: {named}" in failed.stderr
+    assert all(
+        f"{name}={text}" in failed.stdout for name, text in variables.items() if name != "CDPATH"
+    )
+    assert failed.left == []
+
+
+def test_an_environment_that_no_longer_works_is_told(checkout, tmp_path):
+    (checkout / ".venv").unlink()
+    (checkout / ".venv/bin").mkdir(parents=True)
+    (checkout / ".venv/ready").touch()
+    for name, text in (("thesis-repro", "#!/moved/.venv/bin/python"), ("python", "#!/bin/sh")):
+        (checkout / ".venv/bin" / name).write_text(text)
+        (checkout / ".venv/bin" / name).chmod(0o755)
+    failed = run(["make", "lint"], checkout)
+    assert failed.returncode == 2 and "make clean" in failed.stderr
+    assert installed_packages.missing(
+        "numpy==1\nno-such==2  # x\n\n# What those need:\nother==3"
+    ) == ["no-such"]
 
 
 def test_two_runs_in_one_folder_are_refused(checkout):

@@ -45,9 +45,19 @@ def test_changed_sizes_are_part_of_the_name():
 @pytest.mark.parametrize(
     "setting",
     ["EPOCHS=0", "FRAMES=some", "WIDTHS=5-1", "WIDTHS=5,x", "BASE_FILTERS=nan", "PROFILE=huge"]
-    + ["KITTI=/no/such/folder", "JOBS=many", "PROFIL=demo"],
+    + ["KITTI=/no/such/folder", "JOBS=many", "PROFIL=demo", "BUILD=a b", "BUILD=a:b", "BUILD=a#b"]
+    + ["BUILD=a%b"],
 )
 def test_bad_settings_are_named(setting):
     name, text = setting.split("=")
     with pytest.raises(InputError, match=f"^{name}.*: "):
         settings_of(**{name: text})
+
+
+def test_folders_begin_at_home_or_in_the_checkout(monkeypatch, tmp_path):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    (tmp_path / "kitti").mkdir()
+    at_home = settings_of(KITTI="~/kitti", BUILD="~/b", FIGURES="~/f")
+    assert (at_home.kitti, at_home.build.parent) == (tmp_path / "kitti", tmp_path / "b")
+    assert at_home.published.parent == tmp_path / "f"
+    assert settings_of(BUILD="b").world == ROOT / "b/world-demo"

@@ -35,12 +35,23 @@ def handlers():
         (OSError("Can't write data (error message = 'No space left on device')"), "No space left"),
         (MemoryError(), "memory"),
         (InputError("a.png: truncated"), "a.png"),
+        (ImportError("a.so: failed to map segment from shared object", name="numpy"), "memory"),
     ],
 )
 def test_bad_input_and_errors_of_the_machine_are_one_line(error, says, capsys):
     assert program.run(failing(error)) == 1
     line = capsys.readouterr().err
     assert line.startswith("error: ") and says in line and line.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    "target, status, says", [("| true", 141, ""), (">/dev/full", 1, "error: [Errno 28]")]
+)
+def test_what_cannot_be_printed_ends_without_a_traceback(target, status, says):
+    code = "from thesis_repro.running import program; program.run_main(lambda: print('x' * 99999))"
+    command = f'sleep 0.1; {sys.executable} -c "{code}" {target}; exit ${{PIPESTATUS[0]}}'
+    ended = subprocess.run(["bash", "-c", command], capture_output=True, text=True)
+    assert ended.returncode == status and ended.stderr[: len(says) or 1] == says
 
 
 def test_unexpected_errors_are_raised():

@@ -32,6 +32,14 @@ def test_a_folder_with_other_files_is_refused_and_kept(tmp_path):
         provenance.stage(tmp_path, data="one")
 
 
+def test_a_folder_with_what_a_system_puts_there_is_empty(tmp_path):
+    (tmp_path / "lost+found").mkdir()
+    for name in (".DS_Store", "._a", ".nfs000000000000000100000001"):
+        (tmp_path / name).touch()
+    provenance.stage(tmp_path, data="one")
+    assert provenance.record(tmp_path) == {"data": "one"}
+
+
 def test_results_of_other_inputs_move_aside_with_all_that_was_added(tmp_path, monkeypatch):
     folder = provenance.stage(tmp_path / "a", size=3)
     monkeypatch.chdir(folder)

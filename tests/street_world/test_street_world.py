@@ -4,6 +4,8 @@ Also its errors and resuming.
 """
 
 import shutil
+import subprocess
+import sys
 from itertools import product
 
 import cv2
@@ -183,3 +185,9 @@ def test_the_two_halves_make_the_whole_in_either_order(out, tmp_path, parts):
         folders = {path.name for path in tmp_path.iterdir() if path.is_dir()}
         assert folders == set(parts[:count])
     assert contents(tmp_path) == contents(out)
+
+
+def test_it_runs_where_nobody_may_write_a_cache():
+    """As for an unknown user of a container, whose home is /."""
+    code = "import numba.core.caching as c; c.CacheImpl._locator_classes = []; import street_world.raster"
+    subprocess.run([sys.executable, "-c", code], check=True)
