@@ -29,6 +29,13 @@ MAX_STEP, MAX_SPEED = 50.0, 100.0  # metres a frame, metres a second
 MAX_GAP = 10  # intervals between frames
 MASK_SAMPLES = 6  # frames whose masks are looked at
 MIN_SHARE = 0.005  # of the frames: that masks keep, and of a class that is named
+# Classes that fill less than MAX_SELDOM of a street's frames: all but these
+USUAL = (
+    *("unlabeled", "road", "sidewalk", "building", "wall", "fence", "vegetation", "terrain", "sky"),
+    *("person", "car", "truck", "bus"),
+)
+SELDOM = [label for label in cityscapes.LABELS[: cityscapes.N_CLASSES] if label.name not in USUAL]
+MAX_SELDOM = 0.2
 MAX_DROPPED = 0.1  # share of a run's steps
 
 # Problems of folders
@@ -199,9 +206,11 @@ def mask_warnings(source: LabelMasks | MaskFolder) -> list[str]:
     Raises InputError if one of them cannot be read.
     """
     shares = [coverage(source[index]) for index in _sampled(source)]
-    ids, has_label_ids = np.arange(cityscapes.N_CLASSES), False
+    of_classes, has_label_ids = np.ones(cityscapes.N_CLASSES), False
     if isinstance(source, LabelMasks):
-        ids, has_label_ids = np.flatnonzero(_class_shares(source)), source.settings.ids == "labels"
+        of_classes, has_label_ids = _class_shares(source), source.settings.ids == "labels"
+    ids = np.flatnonzero(of_classes)
+    seldom = max(SELDOM, key=lambda label: of_classes[label.id])
     told = [
         (
             len(ids) == 1,
@@ -217,6 +226,11 @@ def mask_warnings(source: LabelMasks | MaskFolder) -> list[str]:
             has_label_ids and ids.max() == cityscapes.ID["license plate"],
             f"label maps hold id {ids.max()}, a license plate, but a garage in KITTI-360; --ids FILE gives "
             "ids the names that are meant",
+        ),
+        (
+            MAX_SELDOM < of_classes[seldom.id] < 1,
+            f"label maps hold {of_classes[seldom.id]:.0%} {seldom.name}, which streets seldom have; do they "
+            "have other ids than --ids says?",
         ),
         (
             min(shares) < MIN_SHARE or min(shares) == 1,

@@ -167,7 +167,7 @@ def test_colours_are_read_through_a_table(tmp_path):
     names = ["road", "car", "sky", "pole", "unlabeled"]
     labels = np.array([[ID[name] for name in names]], np.uint8)
     cv2.imwrite(str(path), COLORS[labels][..., ::-1])
-    assert np.array_equal(label_ids.read(path, label_ids.COLORS), labels)
+    assert np.array_equal(label_ids.read(path, "colors"), labels)
     rows = [("#{:02x}{:02x}{:02x}".format(*COLORS[ID[name]]), name) for name in names]
     assert np.array_equal(label_ids.read(path, table(tmp_path, rows)), labels)
     with pytest.raises(InputError, match="holds #804080, which"):

@@ -12,6 +12,7 @@ from typing import Any
 import shtab
 from joblib import cpu_count
 
+from thesis_repro.data import ids
 from thesis_repro.running import values
 
 
@@ -156,10 +157,10 @@ MASK_OPTIONS: dict[str, Any] = {
     ),
     "--keep": _keep,
     "--ids": dict(
-        metavar="labels|train|colors|FILE",
-        default="labels",
-        help="label maps hold Cityscapes' label ids, train ids or colours, or those of a table with lines such "
-        "as 34,building or #464646,building (labels)",
+        metavar="NAME|FILE",
+        default=ids.LABEL_IDS,
+        help=f"ids or colours that label maps hold: {', '.join(ids.names())}, or a table with lines such as "
+        "34,building or #464646,building (labels)",
     ),
     "--margin": dict(
         type=int, default=0, metavar="PIXELS", help="no keypoints near the frame's border (0)"

@@ -182,9 +182,12 @@ def read_label_map(path: str | Path) -> np.ndarray:
     """
     label_map = read_ids(path)
     if label_map.max() >= N_CLASSES:
+        advice = "give --ids train for train ids (0 to 18, 255)"
+        if label_map[label_map != 255].max(initial=0) >= len(TRAINED):
+            advice = "give --ids FILE for a table of these ids, with a line such as 255,unlabeled"
         raise InputError(
             f"{path}: label id {label_map.max()} is above {N_CLASSES - 1}; take the labelIds.png files, "
-            "or give --ids train for train ids (0 to 18, 255), or --ids FILE for a table of other ids"
+            f"or {advice}"
         )
     return label_map.astype(np.uint8)
 

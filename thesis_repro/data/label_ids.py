@@ -1,43 +1,37 @@
 """Label maps with other ids or colours than Cityscapes' label ids, read through a table.
 
 A table is a CSV file with a line for each id (34,building) or for each colour (#464646,building).
-The names are those of `cityscapes.LABELS`; what is no class is "unlabeled". Two tables have names:
-Cityscapes' train ids ("train") and colours ("colors").
+The names are those of `cityscapes.LABELS`; what is no class is "unlabeled". The folder ids has a
+file for each table with a name.
 """
 
 import csv
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from thesis_repro.data.cityscapes import ID, LABELS, TRAINED, read_label_map
+from thesis_repro.data.cityscapes import ID, read_label_map
+from thesis_repro.data.ids import LABEL_IDS, file, names
 from thesis_repro.data.trajectories import read_text
 from thesis_repro.errors import InputError
 from thesis_repro.running.files import read_color, read_ids
 from thesis_repro.running.provenance import digest_of_file
 
-LABEL_IDS, TRAIN_IDS, COLORS = "labels", "train", "colors"
-# {name: see `read_table`}; of labels with one colour, the first one is meant: "car" before "license
-# plate"
-TABLES: dict[Any, tuple[bool, dict[int, int]]] = {
-    TRAIN_IDS: (
-        False,
-        {255: ID["unlabeled"]} | {number: ID[name] for number, name in enumerate(TRAINED)},
-    ),
-    COLORS: (True, {int.from_bytes(label.color): label.id for label in reversed(LABELS)}),
-}
 NOT_NAMED = 255  # no label id
 RGB = np.array([1 << 16, 1 << 8, 1])  # makes one number of a colour
 
 
-def read_table(path: str | Path) -> tuple[bool, dict[int, int]]:
+def read_table(ids: str | Path) -> tuple[bool, dict[int, int]]:
     """Return (whether it names colours, {id or colour as one number: label id}) of a table.
 
-    Raises InputError, naming the line, for a line that is not an id or a colour and a label.
+    ids: its name or file. Raises InputError, naming the line, for a line that is not an id or a
+    colour and a label.
     """
-    if path in TABLES:
-        return TABLES[path]
+    path = file(ids)
+    if not path.exists():
+        raise InputError(
+            f"--ids {ids}: must be {', '.join(names())}, or a file, which is not there"
+        )
     lines = read_text(path).split("\n")
     table = {}
     for number, row in enumerate(csv.reader(lines), 1):
@@ -56,10 +50,10 @@ def read_table(path: str | Path) -> tuple[bool, dict[int, int]]:
 
 
 def record(ids: str | Path) -> dict[str, str]:
-    """Return what the record of results has of a table in a file: its digest."""
-    if ids in (LABEL_IDS, *TABLES):
+    """Return what the record of results has of a table: its digest."""
+    if ids == LABEL_IDS:
         return {}
-    return {"table": digest_of_file(ids)}
+    return {"table": digest_of_file(file(ids))}
 
 
 def read(path: str | Path, ids: str | Path = LABEL_IDS) -> np.ndarray:
