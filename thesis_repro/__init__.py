@@ -79,11 +79,9 @@ if not TYPE_CHECKING:  # a type checker sees the names above, and no others
                 raise
             # not an ImportError, so that help() and hasattr() work without OpenCV
             raise AttributeError(f"{name}: {missing}") from None
-        if name in _face.DETECTORS:
-            return _face.DETECTORS[name]
-        if name in __all__:
-            return getattr(_face, name)
-        raise unknown
+        if name not in __all__ and name not in _face.DETECTORS:
+            raise unknown
+        return (vars(_face) | _face.DETECTORS)[name]
 
 
 def __dir__() -> list[str]:

