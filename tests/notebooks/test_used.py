@@ -3,12 +3,12 @@
 import os
 import re
 import shutil
+import sys
 
 import pytest
 from cells import NOTEBOOKS
 from trials import succeed
 
-from thesis import used
 from thesis.settings import ROOT
 
 EXECUTED = re.compile(r"--output \.(\d\d)_")  # in the output of make
@@ -22,35 +22,48 @@ def project(tmp_path_factory):
         shutil.copytree(ROOT / name, root / name, ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copy(ROOT / "Makefile", root)
     (root / "run/notebooks").mkdir(parents=True)
-    used.record(root / "run", root)
+    record(root, root / "run")
     for name in ("checked", "drives", *(f"notebooks/{name}" for name in NOTEBOOKS)):
         (root / "run" / name).touch()
     return root
 
 
+def record(root, run):
+    code = f"from pathlib import Path; from thesis import used; used.record(Path({str(run)!r}))"
+    succeed([sys.executable, "-c", code], root, PYTHONPATH=f"{root}:{root}/notebooks")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "changed, again",
+    "changes, again",
     [
-        ("notebooks/06_keypoint_masks.ipynb", "06 07 08 09"),
-        ("notebooks/07_visual_odometry.ipynb", "07"),
-        ("thesis_repro/masks/folders.py", "05 06 07 08 09"),
-        ("street_world/street.py", "01 02 03 04 05 06 07 08 09"),
-        ("notebooks/thesis/domain_gap.py", "05 06 07 08 09"),
-        ("notebooks/thesis/audit.json", "08 09"),
-        ("notebooks/thesis/page.py", ""),
-        ("thesis_repro/odometry/new_detector.py", ""),  # that nothing imports
-        ("notebooks/06_keypoint_masks-Copy1.ipynb", ""),
+        ([("notebooks/06_keypoint_masks.ipynb", "import", " import")], "06 07 08 09"),
+        ([("thesis_repro/masks/filter.py", "cv2.Canny(", "cv2.Canny(*")], "06 07 08 09"),
+        ([("street_world/raster.py", "- 0.5", "- 0.25")], "01 02 04 05 06 07 08 09"),
+        ([("notebooks/thesis/audit.json", "{", " {")], "09"),
+        (
+            [
+                ("notebooks/thesis/page.py", "return", "return 1 and "),
+                ("thesis_repro/odometry/new_detector.py", "", "import cv2"),  # that nothing uses
+                ("thesis_repro/odometry/loop.py", "\n\nclass", "\n\n# a comment\nclass"),
+                ("notebooks/06_keypoint_masks-Copy1.ipynb", "", "{}"),
+            ],
+            "",
+        ),
     ],
 )
-def test_what_has_other_contents_is_executed_again(project, tmp_path, changed, again):
-    """The file keeps its date, as after rsync -a, tar or cp -p."""
+def test_what_uses_other_contents_is_executed_again(project, tmp_path, changes, again):
+    """The files keep their dates, as after rsync -a, tar or cp -p."""
     run = shutil.copytree(project / "run", tmp_path / "run")
-    path = project / changed
-    before = path.read_bytes() if path.exists() else b""
-    path.write_bytes(before + b"\n")
-    os.utime(path, (0, 0))
-    used.record(run, project)
+    before = {}
+    for name, old, new in changes:
+        path = project / name
+        before[path] = path.read_text() if path.exists() else ""
+        assert old in before[path]
+        path.write_text(before[path].replace(old, new))
+        os.utime(path, (0, 0))
+    record(project, run)
     planned = succeed(["make", "-n", "notebooks", f"RUN={run}"], project).stdout
-    path.write_bytes(before)
+    for path, text in before.items():
+        path.write_text(text)
     assert sorted(EXECUTED.findall(planned)) == again.split()
