@@ -131,6 +131,7 @@ HALF = np.repeat([[0, 255]], 48, axis=0).repeat(32, axis=1).astype(np.uint8)
         ("labels", TRAIN, {}, "--ids train"),
         ("labels", TRAIN, {"ids": "train"}, None),
         ("labels", STREET + 11, {}, "KITTI-360"),
+        ("labels", STREET + 3, {"ids": "vistas-1.2"}, "33% parking"),
         ("labels", 0 * STREET + 23, {}, "nothing but sky"),
         ("labels", 0 * STREET, {"ids": "train"}, "nothing but road"),
         ("masks", HALF, {}, None),

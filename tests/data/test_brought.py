@@ -2,16 +2,28 @@
 
 import re
 import shutil
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from thesis_repro import odometry
 from thesis_repro.command.cli import main
-from thesis_repro.data import kitti, label_ids
-from thesis_repro.data.cityscapes import COLORS, ID, LABELS, TRAINED
+from thesis_repro.data import kitti, label_ids, trajectories
+from thesis_repro.data.cameras import DISTORTIONS
+from thesis_repro.data.cityscapes import (
+    COLORS,
+    ID,
+    LABELS,
+    TRAINED,
+    read_image,
+    resize_bilinear,
+)
+from thesis_repro.data.frames import white_level
+from thesis_repro.data.ids import names
 from thesis_repro.data.trajectories import read_poses, write_tum
 from thesis_repro.errors import InputError
 from thesis_repro.masks import folders
@@ -132,6 +144,47 @@ def test_ground_truth_with_times_is_given_to_the_frames_of_these_times(own, name
         kitti.Sequence(None, own, truth=own / "gone.txt")
 
 
+def test_quaternions_need_their_length(own):
+    write_tum(own / "truth.txt", POSES, 0.1 * np.arange(4))
+    rows = np.loadtxt(own / "truth.txt")
+    for factor in (0, 2):
+        scaled = np.column_stack([rows[:, :4], factor * rows[:, 4:]])
+        (own / "truth.txt").write_text(lines(scaled))
+        with pytest.raises(InputError, match="truth.txt: .*length 1"):
+            kitti.Sequence(None, own, truth=own / "truth.txt")
+
+
+NED = np.eye(4)[[1, 2, 0, 3]].T  # of the camera: x forward, y right, z down
+MATRICES = {
+    "Virtual KITTI 2": np.column_stack(
+        [
+            np.repeat(np.arange(4), 2),
+            np.tile([0, 1], 4),
+            np.linalg.inv(POSES).repeat(2, 0).reshape(8, 16),
+        ]
+    ),
+    "TartanAir": np.column_stack(
+        [POSES[:, :3, 3], Rotation.from_matrix((POSES @ np.linalg.inv(NED))[:, :3, :3]).as_quat()]
+    ),
+    "KITTI-360": np.column_stack([[1.0, 3, 4, 7], POSES.reshape(4, 16)]),
+}
+
+
+@pytest.mark.parametrize("name, header", zip(MATRICES, ["frame cameraID r1,1\n", "", ""]))
+def test_poses_of_other_data_sets_come_with_what_converts_them(own, name, header, monkeypatch):
+    path = own / re.search(r"loadtxt\('(.*?)'", trajectories.CONVERSIONS[name])[1]
+    path.write_text(header + lines(MATRICES[name]))
+    with pytest.raises(InputError, match=f"{path.name}: .*{name}") as told:
+        kitti.Sequence(None, own, truth=path)
+    code = str(told.value).split("in Python: ")[1]
+    monkeypatch.chdir(own)
+    copied = []
+    copies = SimpleNamespace(copy=lambda path, folder: copied.append(path))
+    exec(code, {"np": np, "Rotation": Rotation, "shutil": copies})
+    np.testing.assert_allclose(kitti.Sequence(None, own).poses, POSES, atol=1e-9)
+    assert len(copied) == (4 if name == "KITTI-360" else 0)
+
+
 IDS = np.repeat([[7, 11], [34, 300]], 3, axis=0).astype(np.uint16)
 NAMES = {7: "road", 11: "building", 34: "building", 300: "unlabeled"}
 EXPECTED = np.array([[ID[NAMES[value]] for value in row] for row in IDS.tolist()], np.uint8)
@@ -160,6 +213,27 @@ def test_ids_of_other_data_sets_are_read_through_a_table(tmp_path):
     cv2.imwrite(str(path), np.array([[*range(19), 255]], np.uint8))
     named = [LABELS[label].name for label in label_ids.read(path, "train")[0]]
     assert named == [*TRAINED, "unlabeled"]
+
+
+def test_tables_with_names(tmp_path):
+    path = tmp_path / "a.png"
+    for name in names()[1:]:
+        has_colors, table = label_ids.read_table(name)
+        assert has_colors == (name == "colors") and max(table.values()) < 35
+    assert label_ids.read_table("bdd100k") == label_ids.read_table("train")
+    cv2.imwrite(str(path), np.array([[13, 17, 27, 30, 55, 65]], np.uint8))
+    named = [LABELS[label].name for label in label_ids.read(path, "vistas-1.2")[0]]
+    assert named == ["road", "building", "sky", "vegetation", "car", "unlabeled"]
+    with pytest.raises(InputError) as told:
+        label_ids.read(path, "mapilary")
+    assert all(name in str(told.value) for name in names())
+
+
+@pytest.mark.parametrize("other, advice", [(18, "--ids train"), (26, "255,unlabeled")])
+def test_the_advice_for_255_among_label_ids_is_one_that_reads_it(tmp_path, other, advice):
+    cv2.imwrite(str(tmp_path / "a.png"), np.array([[7, other, 255]], np.uint8))
+    with pytest.raises(InputError, match=f"a.png: label id 255.*{advice}"):
+        label_ids.read(tmp_path / "a.png")
 
 
 def test_colours_are_read_through_a_table(tmp_path):
@@ -255,6 +329,14 @@ distortion_coefficients: [-0.3, 0.1, 0.01, -0.02]
 """
 
 
+K = [50.0, 0.0, 32.0, 0.0, 51.0, 24.0, 0.0, 0.0, 1.0]
+D = NUMBERS[4:]
+
+
+def block(numbers):
+    return "".join(f"- {number}\n" for number in numbers)
+
+
 @pytest.mark.parametrize(
     "name, text",
     [
@@ -268,6 +350,10 @@ distortion_coefficients: [-0.3, 0.1, 0.01, -0.02]
         ("camera.yaml", ROS),
         ("camera.yaml", CAMERA_INFO),
         ("camera.yaml", EUROC),
+        *(("camera.yaml", f"K: {K}\n{key}: {D}\n") for key in DISTORTIONS),
+        ("camera.yaml", "".join(f"{key}:\n{block(of)}" for key, of in (("k", K), ("d", D)))),
+        ("camera.yaml", f"camera_matrix: {[K[:3], K[3:6], K[6:]]}\ndist_coeff: {[D]}\n"),
+        ("camera.yaml", f"camera_model: plumb_bob\n{CAMERA_INFO}"),
     ],
 )
 def test_distortion_is_taken_out_as_opencv_does(own, name, text):
@@ -303,6 +389,8 @@ def test_another_file_is_no_camera(own, name, text):
     "text, model",
     [
         (f"fisheye_model: 1\n{OPENCV}", "fisheye_model is 1"),
+        (f"K: {K}\n", "has no distortion that is understood"),
+        (f"K: {K}\nlens: {D}\n", "has no distortion that is understood"),
         (KALIBR.replace("radtan", "equidistant"), "distortion_model is equidistant"),
         (KALIBR.replace("pinhole", "omni"), "camera_model is omni"),
         (ROS.replace("plumb_bob", "fisheye"), "distortion_model is fisheye"),
@@ -338,6 +426,37 @@ def test_a_rough_camera_is_four_numbers(own):
     sequence = kitti.Sequence(None, own, calibration=own / "camera.txt")
     assert np.array_equal(sequence.intrinsics, [[64, 0, 32], [0, 64, 24], [0, 0, 1]])
     assert np.array_equal(sequence.frame(0), kitti.Sequence(None, own).frame(0))
+
+
+def test_hot_pixels_do_not_make_16_bit_frames_dark(own, caplog):
+    expected = kitti.Sequence(None, own).frame(0)
+    for path in sorted(own.glob("*.png")):
+        frame = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE).astype(np.uint16) * 16
+        frame[5, 5] = 65535
+        cv2.imwrite(str(path), frame)
+    frame = kitti.Sequence(None, own).frame(0)
+    assert np.abs(np.delete(frame, 5, 0).astype(int) - np.delete(expected, 5, 0)).max() <= 2
+    path = own / "000000.png"
+    resized = read_image(path, 24, 32, white=white_level(path))  # as a network gets it
+    assert np.array_equal(resized[..., 0], resize_bilinear(frame, (24, 32)))
+    assert not any(record.levelname == "WARNING" for record in caplog.records)
+
+
+def test_thermal_frames_are_told_before_they_are_flat(own, caplog):
+    for path in sorted(own.glob("*.png")):
+        frame = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE).astype(np.uint16)
+        cv2.imwrite(str(path), 20000 + 4 * frame)
+    assert kitti.Sequence(None, own).frame(0).min() > 230
+    (record,) = [record for record in caplog.records if record.levelname == "WARNING"]
+    assert "gray levels" in record.getMessage()
+
+
+@pytest.mark.parametrize("kinds", [("left_", "right_"), ("rgb", "depth"), ("", "d")])
+def test_frames_of_two_cameras_in_one_folder_are_refused(own, kinds):
+    for index, path in enumerate(sorted(own.glob("*.png"))):
+        path.rename(own / f"{kinds[index % 2]}{index // 2:03d}.png")
+    with pytest.raises(InputError, match=rf"own: holds .*{kinds[1]}\*.png"):
+        kitti.Sequence(None, own)
 
 
 def test_frames_of_16_bits_are_scaled_by_their_maximum(own, caplog):

@@ -66,6 +66,15 @@ def test_without_ground_truth_steps_are_assumed(tiny_kitti):
         kitti.Sequence(tiny_kitti, "00", speed=5)
 
 
+def test_a_right_camera_has_poses_of_its_own(tiny_kitti):
+    folder = tiny_kitti / "sequences/00"
+    shutil.copytree(folder / "image_0", folder / "image_1")
+    with open(folder / "calib.txt", "a") as file:
+        file.write("P1: 50 0 32 -25 0 50 24 0 0 0 1 0\n")
+    left, right = kitti.Sequence(tiny_kitti, "00/"), kitti.Sequence(tiny_kitti, "0/", "image_1")
+    np.testing.assert_allclose(right.poses[:, :3, 3], left.poses[:, :3, 3] + [0.5, 0, 0])
+
+
 def test_frames_a_second_replace_a_missing_file_of_times(tiny_kitti):
     with pytest.raises(InputError, match="times.txt"):
         kitti.Sequence(tiny_kitti, "00", fps=25)
@@ -169,6 +178,15 @@ def test_a_folder_of_drives_is_a_root_and_a_link_a_sequence(drive, tiny_kitti):
         assert sequence.name == name and np.array_equal(sequence.poses, expected.poses)
         assert checks.check_kitti(root) == []
     assert [folder for folder, _ in cli._image_folders(drive.parent)] == [drive]
+
+
+def test_a_gps_without_a_lock_is_told(drive):
+    assert checks.sequence_warnings(kitti.Sequence(None, drive)) == []
+    path = drive / "oxts/data/0000000002.txt"
+    numbers = path.read_text().split()
+    path.write_text(" ".join([*numbers[:23], "9.5", *numbers[24:]]))
+    (line,) = checks.sequence_warnings(kitti.Sequence(None, drive))
+    assert "9.5 m" in line and path.name in line
 
 
 @pytest.mark.parametrize(
