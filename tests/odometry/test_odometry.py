@@ -184,6 +184,7 @@ def assert_on_squares(detector):
     frame = np.full((160, 480), 90, np.uint8)
     for u, v in SQUARES:
         frame[v - 7 : v + 7, u - 7 : u + 7] = 220
+    frame = cv2.GaussianBlur(frame, (0, 0), 1)  # FAST finds nothing on sharp ones
     points = inputs.keypoints(detector(frame, THESIS, None), frame, "detector")
     distances = np.abs(points[:, None] - SQUARES).max(axis=2)
     assert (distances.min(axis=0) < 14).all() and (distances.min(axis=1) < 14).all()

@@ -47,8 +47,6 @@ class SequenceLike(Protocol):
 class ArraySequence:
     """A sequence of frames in memory: `Sequence.from_arrays(frames, intrinsics, ...)`."""
 
-    name = "frames in memory"
-
     def __init__(
         self,
         frames: Any,
@@ -57,6 +55,7 @@ class ArraySequence:
         poses: Any = None,
         speed: float | None = None,
         times: Any = None,
+        name: str = "frames in memory",
     ) -> None:
         """Check everything but the frames, which the odometry checks when it takes them.
 
@@ -64,7 +63,7 @@ class ArraySequence:
         width) uint8. intrinsics: 3x3, pixels, (fx, 0, u), (0, fy, v), (0, 0, 1).
         How long the steps are: scales, (n,), metres since the frame before, the first one 0; or
         poses, (n, 4, 4), true camera-to-world poses, metres; or speed, metres a second, with times,
-        (n,), seconds; or none of them, for one metre a frame.
+        (n,), seconds; or none of them, for one metre a frame. name: in tables and messages.
         Raises InputError for something else.
         """
         if not hasattr(frames, "__len__") or not len(frames):
@@ -74,6 +73,7 @@ class ArraySequence:
         if speed is not None and times is None:
             raise InputError("speed: needs the times of the frames, in seconds")
         self._frames, self.intrinsics = frames, np.array(intrinsics, float)
+        self.name = self.poses_path = name
         self.times = _numbers("times", times, FRAME_TIME * np.arange(len(frames)))
         self.scales = _numbers("scales", scales, step_lengths(self.times, speed))
         self.has_truth = poses is not None
@@ -87,7 +87,7 @@ class ArraySequence:
     def poses(self) -> np.ndarray:
         """True camera-to-world poses, (n, 4, 4), metres. Raises InputError if there are none."""
         if not self.has_truth:
-            raise InputError("poses: none were given for the frames, but ground truth is needed")
+            raise InputError(f"{self.name}: no poses were given; ground truth is needed")
         return self._poses
 
     @property
