@@ -9,7 +9,9 @@ import write_texts
 from thesis_repro.odometry import metrics
 
 
-@pytest.mark.parametrize("template, words", [("README.md.j2", 900), ("answer.md.j2", 1200)])
+@pytest.mark.parametrize(
+    "template, words", [("README.md.j2", 900), ("answer.md.j2", 1200), ("options.md.j2", 1800)]
+)
 def test_texts_in_git_are_those_of_the_tables_and_short(template, words):
     written = write_texts.WRITTEN[template].read_text(encoding="utf-8")
     assert written.splitlines() == write_texts.render(template).splitlines()

@@ -1,4 +1,4 @@
-"""Write README.md and docs/answer.md from docs/templates, with numbers from the tables in git.
+"""Write README.md and docs from docs/templates, with numbers from the tables in git.
 
 `make page` runs it, and `tools/evidence.py` at its end. A template asks the functions below for the
 row of a table, and writes its numbers. Its only conditions are the outcomes of verdicts.
@@ -14,11 +14,14 @@ from keypoint_study import worth as worths
 from keypoint_study.report import texts
 from thesis import few_keypoints
 from thesis.settings import ROOT
+from thesis_repro.command import cli
+from thesis_repro.command.options import build_parser
 from thesis_repro.running import program
 from thesis_repro.running.files import write_text
 
 TEMPLATES = ROOT / "docs" / "templates"
-WRITTEN = {"README.md.j2": ROOT / "README.md", "answer.md.j2": ROOT / "docs" / "answer.md"}
+WRITTEN = {"README.md.j2": ROOT / "README.md"}
+WRITTEN |= {f"{name}.md.j2": ROOT / f"docs/{name}.md" for name in ("answer", "options")}
 REAL = "kitti_excerpts/"  # tables on real frames
 NAMES = ("sequence", "row", "source", "metric", "estimator")  # columns of texts, if empty, too
 
@@ -116,6 +119,13 @@ def of_rendered(metric: str) -> str:
     return text.partition(",")[0]
 
 
+def commands() -> dict[str, Any]:
+    """Return the parser of options of each command."""
+    parser = build_parser(cli.COMMANDS)
+    (action,) = [each for each in parser._actions if each.dest == "command"]
+    return dict(action.choices or {})
+
+
 def whole(number: float) -> str:
     """Return a number without decimals."""
     return f"{number:.0f}"
@@ -140,6 +150,7 @@ def render(template: str) -> str:
 # that templates call
 FUNCTIONS = (
     read_table,
+    commands,
     cell,
     error,
     verdict,
@@ -157,7 +168,7 @@ FUNCTIONS = (
 
 
 def main() -> None:
-    """Write both texts."""
+    """Write the texts."""
     for template, path in WRITTEN.items():
         write_text(path, render(template))
 
