@@ -1,7 +1,7 @@
 """The dilation width that the thesis chooses for each sequence, and how stable this choice is.
 
 A change is Equation 4.1 of means over the repetitions, in percent; negative is better. `masked` and
-`baseline` are the runs with masks and with all keypoints, from `compare.of_method`.
+`baseline` are the runs with masks and with all keypoints, from `comparisons.of_method`.
 """
 
 from typing import Any

@@ -7,7 +7,7 @@ from typing import Any
 
 import pandas as pd
 
-from keypoint_study import compare, jobs, runner, sources, worth
+from keypoint_study import comparisons, jobs, runner, sources, worth
 from keypoint_study.sources import Source
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
@@ -56,7 +56,7 @@ class Study:
                 raise InputError(
                     f"{sequence.folder}: {len(sequence)} frames; a study needs 3 or more"
                 )
-            if sequence.name in compare.COLUMNS:
+            if sequence.name in comparisons.COLUMNS:
                 raise InputError(
                     f"{sequence.folder}: has the name of a column of the tables; rename the sequence"
                 )
@@ -151,14 +151,14 @@ class Study:
     def worths(
         self, folder: Path, processes: int = 1, scheduler: str | None = None
     ) -> pd.DataFrame | None:
-        """Return what a keypoint of each source is worth (`worth.measure`), without ground truth.
+        """Return what a keypoint of each source is worth (`worth.worths_of`), without ground truth.
 
         What is in the folder is kept. None if no source has masks or keypoints. With a tested
         width, also of the controls.
         """
         if all(source.kind == "paths" for source in self.sources):
             return None
-        return worth.measure(
+        return worth.worths_of(
             self.opened,
             self.sources,
             self.shown_width,

@@ -17,10 +17,10 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from keypoint_study import compare
+from keypoint_study import comparisons
 from keypoint_study.controls import min_distance
-from keypoint_study.errors import path_errors
 from keypoint_study.jobs import Job, Run, repeated
+from keypoint_study.path_errors import path_errors
 from keypoint_study.sources import Source
 from thesis_repro import odometry
 from thesis_repro.data.kitti import Sequence
@@ -342,7 +342,7 @@ def keypoint_controls(
     """
     jobs: list[Job] = []
     for source in sources:
-        keypoints = compare.keypoints_left(compare.of_source(runs, source.name))
+        keypoints = comparisons.keypoints_left(comparisons.of_source(runs, source.name))
         width_of_source = width if source.has_width else None
         for sequence in sequences:
             if sequence.name not in keypoints:  # its runs with masks failed

@@ -1,52 +1,14 @@
 """What a keypoint is worth: how much one of a choice tells about a step's motion. No ground truth.
 
 Statistics calls it the relative efficiency of a choice: a ratio of variances at an equal number of
-observations, here estimated from random half-samples (split-half, in the theory of tests). If n
-keypoints give a motion with the variance V / n, two disjoint halves of n1 and n2 of them give
-motions that differ by an angle of variance V (1 / n1 + 1 / n2).
+observations, here estimated from random half-samples. If n keypoints give a motion with the
+variance V / n, two disjoint halves of n1 and n2 of them give motions that differ by an angle of
+variance V (1 / n1 + 1 / n2). So the variance of one keypoint is the median over steps and splits of
+angle^2 n1 n2 / (n1 + n2), and the worth is this variance of random keypoints divided by that of the
+choice.
 
-The rule, fixed before the runs that the tables show:
-
-1. **Measure.** The variance of one keypoint is the median over steps and splits of angle^2 n1 n2 /
-   (n1 + n2). The angle is the one between the rotations, or the directions of translation, of both
-   halves. The worth is this variance of as many random keypoints (drawn from all keypoints of the
-   same frame) divided by that of the choice. So random keypoints have 1, and a keypoint of worth
-   1/2 tells half as much: twice as many of them give the same precision.
-2. **Motion.** RANSAC and the refined fit of each half alone, without the comparison with the step
-   before, so that the halves share nothing but the step. A half without a motion counts with 180
-   degrees. Keypoints that the tracker loses count in n1 and n2: they tell nothing.
-3. **Steps** of at least 0.25 m, as for all directions (`metrics.MIN_DIRECTED_STEP`); all steps of a
-   sequence without lengths.
-4. **Numbers.** 400 keypoints decide, drawn at random from the choice unless it chooses how many
-   itself (spread, strongest); 100, 200 and all of a choice stand beside. A choice that has fewer is
-   compared with as few random ones. Masks have the width 10.
-5. **Splits.** Three of each of two kinds, with new draws, seed 0. *Fields*: fields of the frame of
-   42 pixels, two windows of the tracker, from a random corner on, go into one half as a whole.
-   *Points*: each keypoint for itself. What neighbours share (pixels, a wrongly drawn boundary) is
-   in both halves of a split by points, which cannot see it: a keypoint and its copy have a worth of
-   1 there and of 1/2 by fields (seen in a simulated scene before this was written). But fields can
-   underrate a choice that lies in few of them, because its halves are less alike. So the number
-   that is told is that of fields, and a verdict needs both.
-6. **Units** are streets: one worth a street, their typical value and its interval by
-   `compare.typical_interval` of logarithms. Shuffles, splits and steps are no units.
-7. **Verdict.** "less" or "more": the whole 95 % interval is on this side of 1 for rotation and
-   direction, by fields and by points. "as much": all four 90 % intervals lie within 0.8 to 1.25.
-   Otherwise "no clear difference". Fewer than six streets are too few to tell.
-8. **Check.** A second, independent draw of random keypoints is a choice like all others (`random`).
-   If a 95 % interval of it excludes 1, the measure is wrong and says nothing.
-9. **One standard for all choices.** Beside the worth: the streets on which a choice fails, the
-   aligned ATE and the rotation error against all keypoints, with both estimators, with and without
-   street 01, and rule 5 of few keypoints (no worse) for every choice, with failures counted as
-   streets.
-
-Known before: a prototype on eleven streets, eight of which are those at hand, with splits by points
-(direction and rotation): random 1.02, 1.01; spread 1.46, 1.24; strongest 0.96, 0.96; exact
-boundaries 0.77, 1.02; the thesis's mask 0.51, 0.65. So the result by points is no surprise; that by
-fields was not known.
-
-Limits: both halves share a bias of the whole step (calibration, a rolling shutter, a moving crowd),
-which only the error against a ground truth shows. The worth holds for its number: the more
-keypoints there are, the more of what they tell they share.
+The rule, which was fixed before the runs, and its limits are in docs/reading-results.md, the words
+for its outcomes in `verdicts.WORTH`.
 """
 
 from collections.abc import Callable, Collection, Iterable, Mapping
@@ -61,10 +23,11 @@ import numpy as np
 import pandas as pd
 
 import opencv_exact
-from keypoint_study import compare, jobs
+from keypoint_study import jobs, ratios, verdicts
 from keypoint_study.methods import METHODS, changed
 from keypoint_study.runner import TABLES, reader_of, record_of
 from keypoint_study.sources import UNMASKED, Source, own_calls
+from keypoint_study.verdicts import verdict
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError, cause
 from thesis_repro.odometry import (
@@ -94,8 +57,6 @@ MAX_STEPS = 200  # of a sequence, at equal distances; no street of the tables ha
 MIN_RANDOM = 20  # random keypoints with which even a choice of fewer is compared
 NO_MOTION = 180.0  # degrees, the angle to a half without a motion
 FILL = 5  # keypoints in each of 16 x 5 fields of the frame, for masks that are filled
-AS_MUCH = 1.25  # a worth from 1 / AS_MUCH to AS_MUCH is "as much"
-LESS, MORE, ALIKE = "less", "more", "as much"
 MOTIONS = ("rotation", "direction")
 
 _RANDOM = ("", 0)  # the choice of all keypoints, from which the random ones are drawn
@@ -113,12 +74,12 @@ class Tracks(NamedTuple):
     threshold: float
 
 
-def worth(
+def worth_of(
     sequence: Sequence,
     chosen: Choices,
     calls: Mapping[str, Calls] = {},
 ) -> pd.DataFrame:
-    """Return what a keypoint of each choice is worth on a sequence, by the rule above.
+    """Return what a keypoint of each choice is worth on a sequence.
 
     chosen: {(name, number): (settings, masks)}, as for `odometry.run_many`; so many keypoints are
     drawn from those that the settings and the masks leave, 0 for all of them. calls: of choices
@@ -252,7 +213,7 @@ def _angles(first: Motion | None, second: Motion | None) -> tuple[float, float]:
 # The choices of a study
 
 
-def choices(
+def choices_of(
     sequence: Sequence,
     sources: Iterable[Source],
     width: int | None,
@@ -261,10 +222,10 @@ def choices(
     masked_settings: Mapping[str, Any] = {},
     named: Collection[str] = (),
 ) -> tuple[Choices, dict[str, Path]]:
-    """Return the choices of a study, as `worth` takes them, and the files of own keypoints by name.
+    """Return the choices of a study for `worth_of`, and the files of own keypoints by name.
 
     Keypoints of every source, and without it random, spread and the strongest ones. number: see
-    `worth`; only for all of a choice (0), there are no spread and strongest ones. with_controls:
+    `worth_of`; only for all of a choice (0), there are no spread and strongest ones. with_controls:
     also masks that are filled, and the controls of `jobs.mask_controls`; named: see there.
     """
     chosen: dict[str, tuple] = {"random keypoints": (THESIS, None)}
@@ -294,7 +255,7 @@ def choices(
     return {(name, number): choice for name, choice in chosen.items()}, own
 
 
-def measure(
+def worths_of(
     sequences: Iterable[Sequence],
     sources: Iterable[Source],
     width: int | None,
@@ -304,17 +265,17 @@ def measure(
     scheduler: str | None = None,
     **options: Any,
 ) -> pd.DataFrame:
-    """Return the table of `worth` for the `choices` of sources; what is in the folder is kept.
+    """Return the table of `worth_of` for the `choices_of` sources; what is in the folder is kept.
 
     width: pixels, of masks from label maps. processes, scheduler: see `workers.open_pool`.
-    options: of `choices`. A sequence without a result is left out with a warning. Raises InputError
-    if none has one.
+    options: of `choices_of`. A sequence without a result is left out with a warning. Raises
+    InputError if none has one.
     """
     sources, numbers = list(sources), list(numbers)
     digest = cache(provenance.digest_of_files)
     calls: list[tuple] = []
     for sequence in sequences:
-        deciding, own = choices(sequence, sources, width, DECIDING, **options)
+        deciding, own = choices_of(sequence, sources, width, DECIDING, **options)
         stage = provenance.stage(
             folder / sequence.name,
             sequence=sequence.digest(),
@@ -324,7 +285,7 @@ def measure(
             **provenance.versions("opencv", "numpy", "numba"),
         )
         for number in numbers:
-            chosen, _ = choices(sequence, sources, width, number, **options)
+            chosen, _ = choices_of(sequence, sources, width, number, **options)
             calls.append((stage / f"{number}.csv", sequence, chosen, own))
     missing = [call for call in calls if not call[0].is_file()]
     with open_pool(processes, scheduler) as pool:
@@ -338,9 +299,9 @@ def measure(
 
 
 def _measure_one(file: Path, sequence: Sequence, chosen: Choices, own: Mapping[str, Path]) -> str:
-    """Write the table of `worth`; return the reason if there is none."""
+    """Write the table of `worth_of`; return the reason if there is none."""
     try:
-        table = worth(sequence, chosen, {name: own_calls(path) for name, path in own.items()})
+        table = worth_of(sequence, chosen, {name: own_calls(path) for name, path in own.items()})
     except InputError as error:
         return str(error)
     except Exception as error:  # of own keypoints
@@ -352,11 +313,11 @@ def _measure_one(file: Path, sequence: Sequence, chosen: Choices, own: Mapping[s
 # Over several streets
 
 
-def typical(table: pd.DataFrame) -> pd.DataFrame:
+def typical_worths(table: pd.DataFrame) -> pd.DataFrame:
     """Return the typical worth of each choice and number over the sequences, and its verdict.
 
-    table: of `worth`, of several sequences. One row a choice and number: keypoints, n (sequences),
-    verdict; for each motion and split, such as rotation_fields: the typical worth, its 95 %
+    table: of `worth_of`, of several sequences. One row a choice and number: keypoints, n
+    (sequences), verdict; for each motion and split, such as rotation_fields: the typical worth, its
     interval (_low, _high), and the number of sequences with a worth below 1 (_below).
     """
     rows = []
@@ -366,26 +327,22 @@ def typical(table: pd.DataFrame) -> pd.DataFrame:
         for motion in MOTIONS:
             for split, of_split in chosen.groupby("split", sort=False):
                 worths[f"{motion}_{split}"] = np.log(of_split[motion])
-        row |= {"n": chosen["sequence"].nunique(), "verdict": _verdict(worths.values())}
+        row |= {"n": chosen["sequence"].nunique(), "verdict": _verdict(worths)}
         for name, logarithms in worths.items():
-            numbers = np.exp(compare.typical_interval(logarithms))
+            numbers = np.exp(ratios.typical_interval(logarithms))
             row |= dict(zip((name, f"{name}_low", f"{name}_high"), numbers, strict=True))
             row[f"{name}_below"] = int((logarithms < 0).sum())
         rows.append(row)
     return pd.DataFrame(rows)
 
 
-def _verdict(worths: Iterable[pd.Series]) -> str:
-    """Return the verdict of rule 7 on the logarithms of the worths of both motions and splits."""
-    worths = list(worths)
-    if min(map(len, worths)) < compare.MIN_SEQUENCES:
-        return compare.TOO_FEW
-    intervals = np.array([compare.typical_interval(each)[1:] for each in worths])
-    narrow = np.array([compare.typical_interval(each, level=90)[1:] for each in worths])
-    if (intervals < 0).all():
-        return LESS
-    if (intervals > 0).all():
-        return MORE
-    if (np.abs(narrow) <= np.log(AS_MUCH)).all():
-        return ALIKE
-    return compare.NO_CLEAR_DIFFERENCE
+def _verdict(worths: Mapping[str, pd.Series]) -> str:
+    """Return the verdict on the logarithms of the worths of both motions and splits, by name."""
+    fewest = min(map(len, worths.values()))
+    intervals = [ratios.typical_interval(each)[1:] for each in worths.values()]
+    sides = [ratios.side_of_one(*np.exp(ends)) for ends in intervals]
+    narrow = [
+        (name.partition("_")[0], *ratios.narrow_interval(np.exp(each)))
+        for name, each in worths.items()
+    ]
+    return verdict(verdicts.WORTH, fewest, sides, narrow)

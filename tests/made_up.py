@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 from scipy.spatial.transform import Rotation
 
-from keypoint_study import compare
+from keypoint_study import comparisons
 from keypoint_study.jobs import Job
 
 
@@ -40,7 +40,7 @@ def runs(
         row |= {"failed": 0.0, "lost": 0, "mean_keypoints": 1900}
         if width:
             row["mean_keypoints"] = 500 + width
-        row |= dict.fromkeys(compare.METRICS, error)
+        row |= dict.fromkeys(comparisons.METRICS, error)
         row["mae"] = error / 2
         rows.append(row)
     return pd.DataFrame(rows).astype({"dilation_width": float})

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from keypoint_study import compare, jobs, runner, worth
+from keypoint_study import comparisons, jobs, ratios, runner, worth
 from keypoint_study.report import style, texts
-from keypoint_study.report import worth as report_worth
+from keypoint_study.report import worths as report_worths
 from keypoint_study.sources import Source
 from thesis import few_keypoints
 from thesis.settings import ROOT, read_settings
@@ -68,7 +68,7 @@ def write(settings, folder):
     )
     few = few_keypoints.ratios_to_all(few_runs)
     times = few_keypoints.time_steps(sequences[0], labels, few_folder)
-    worths = worth.measure(
+    worths = worth.worths_of(
         sequences,
         [Source(labels)],
         jobs.CONTROL_WIDTH,
@@ -81,20 +81,16 @@ def write(settings, folder):
     provenance.sweep(folder)
     for name in KEPT:
         _copy(settings.figures, name, folder)
-    style.save_all(
-        {
-            "few_keypoints": few_keypoints.figure_of_few(few),
-            "worth": report_worth.figure(worths),
-        },
-        {
-            "streets": streets,
-            "few_keypoints": few_keypoints.table_of_few(few, times),
-            "worth": report_worth.table(worths),
-            "refined_widths": table_of_widths(of_widths),
-        },
-        folder,
-        note,
-    )
+    style.save_figure(few_keypoints.figure_of_few(few), folder, "few_keypoints", note)
+    for artefact in (report_worths.figure_of_worths(worths), report_worths.table_of_worths(worths)):
+        style.save(artefact, folder, note)
+    for_readers = {
+        "streets": streets,
+        "few_keypoints": few_keypoints.table_of_few(few, times),
+        "refined_widths": table_of_widths(of_widths),
+    }
+    for name, rows in for_readers.items():
+        style.save_table(rows, folder, name, note)
     tables = {name: _read(settings, name) for name in RUNS} | {
         "few_keypoints_runs": few_runs,
         "worth_runs": worths,
@@ -153,16 +149,16 @@ def runs_of_widths(settings, sequences, labels):
 
 def table_of_widths(runs):
     """Return one row a width: errors divided by those with all keypoints, and failed runs."""
-    everything = compare.of_method(runs, "baseline", "refined")
-    masked = compare.of_method(runs, "masked", "refined")
+    everything = comparisons.of_method(runs, "baseline", "refined")
+    masked = comparisons.of_method(runs, "masked", "refined")
     rows = []
     for width, of_width in masked.groupby("dilation_width"):
         row = {"dilation width (pixels)": int(width)}
         row["keypoints"] = f"{of_width['mean_keypoints'].mean():.0f}"
-        for error, title in compare.JUDGING_METRICS.items():
-            ratio = compare.typical_ratio(compare.ratios(of_width, everything, error))
+        for error, title in comparisons.JUDGING_METRICS.items():
+            ratio = ratios.typical_ratio(ratios.ratios_of(of_width, everything, error))
             row[title] = f"{texts.short(ratio)}, {ratio['above']} of {ratio['n']} above 1"
-        rows.append(row | {"failed runs": compare.count_failed(of_width)})
+        rows.append(row | {"failed runs": ratios.count_failed(of_width)})
     return pd.DataFrame(rows)
 
 

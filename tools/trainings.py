@@ -19,7 +19,7 @@ import numpy as np
 import pandas as pd
 import tensorflow as tf
 
-from keypoint_study import compare, jobs, runner
+from keypoint_study import comparisons, jobs, runner, verdicts
 from keypoint_study.sources import Source
 from thesis.settings import ROOT, read_settings
 from thesis_repro.data import cityscapes, kitti
@@ -35,8 +35,8 @@ from thesis import domain_gap, section_4_2
 from thesis.trainings import TABLE
 
 SEEDS = range(10)  # the first one is the default run's
-METRICS = (*compare.JUDGING_METRICS, "rmse")
-DECIDING = "refined"  # estimator, as in compare.judging_estimator
+METRICS = (*comparisons.JUDGING_METRICS, "rmse")
+DECIDING = "refined"  # estimator, as in comparisons.judging_estimator
 
 
 def train(settings, seed):
@@ -125,7 +125,7 @@ def run(settings, sources):
 
 def is_needed(job):
     """Say whether a column of TABLE is made from a run."""
-    if job.method in compare.SEGMENTATION_FREE_CONTROLS:
+    if job.method in comparisons.SEGMENTATION_FREE_CONTROLS:
         return job.estimator == DECIDING
     is_tested = job.dilation_width in (None, jobs.CONTROL_WIDTH)
     return job.method in ("baseline", "masked") and (is_tested or job.repetition == 0)
@@ -133,30 +133,31 @@ def is_needed(job):
 
 def rows(runs, comparison, source, facts):
     """Yield one row for each estimator, for one training."""
-    own = compare.of_source(runs, source.name)
+    own = comparisons.of_source(runs, source.name)
     is_masked = (comparison["source"] == source.name) & (comparison["method"] == "masked")
     table = comparison[is_masked & comparison["tested"]]
     for estimator in ("thesis", DECIDING):
         pairs = table[table["estimator"] == estimator]
-        ratios = pairs[pairs["reference"] == "baseline"].set_index("metric")
+        of_all = pairs[pairs["reference"] == "baseline"].set_index("metric")
         row = {
             "training": source.name,
             **facts,
             "estimator": estimator,
-            "keypoints": ratios["keypoints"].iloc[0],
+            "keypoints": of_all["keypoints"].iloc[0],
         }
         for metric in METRICS:
             for end in ("ratio", "low", "high"):
-                row[f"{metric}_{end}"] = ratios.loc[metric, end]
-        row["verdict"] = compare.overall(ratios.loc[list(compare.JUDGING_METRICS), "verdict"])
+                row[f"{metric}_{end}"] = of_all.loc[metric, end]
+        row["verdict"] = comparisons.verdict_of(of_all.loc[list(comparisons.JUDGING_METRICS)])
         if estimator == DECIDING:
             judging = pairs[
-                pairs["decides"] & pairs["reference"].isin(compare.SEGMENTATION_FREE_CONTROLS)
+                pairs["decides"] & pairs["reference"].isin(comparisons.SEGMENTATION_FREE_CONTROLS)
             ]
-            verdicts = judging.groupby("reference")["verdict"].agg(compare.overall)
-            row["controls_beaten"] = (verdicts == compare.LOWER).sum()
+            of_controls = judging.groupby("reference")[["low", "high", "n"]]
+            beaten = of_controls.apply(comparisons.verdict_of) == verdicts.LOWER
+            row["controls_beaten"] = beaten.sum()
         else:
-            masked, baseline = (compare.of_method(own, name) for name in ("masked", "baseline"))
+            masked, baseline = (comparisons.of_method(own, name) for name in ("masked", "baseline"))
             best = section_4_2.of_chosen_width(masked)
             changes = section_4_2.changes(best, baseline, "rmse")
             row["table_4_2_mean"] = changes.mean()
@@ -172,7 +173,7 @@ def main():
         made = pool.run(label_maps, calls)
         trained = list(files.progress(made, "trainings", len(calls), "network"))
     runs = run(settings, [source for source, _ in trained])
-    comparison = compare.comparisons(runs)
+    comparison = comparisons.comparisons_of(runs)
     table = pd.DataFrame(
         row for source, facts in trained for row in rows(runs, comparison, source, facts)
     )

@@ -4,12 +4,13 @@
 row of a table, and writes its numbers. Its only conditions are the outcomes of verdicts.
 """
 
+import re
 from functools import cache
 from typing import Any
 
 import pandas as pd
 
-from keypoint_study import compare
+from keypoint_study import comparisons, ratios
 from keypoint_study import worth as worths
 from keypoint_study.report import texts
 from thesis import few_keypoints
@@ -45,7 +46,7 @@ def cell(name: str, column: str, row: dict[str, Any]) -> Any:
 def compared(where: str) -> pd.DataFrame:
     """Return the comparisons of the runs on real frames, or of some of them."""
     runs = read_table(f"{REAL}runs")
-    return compare.comparisons(runs.query(where) if where else runs)
+    return comparisons.comparisons_of(runs.query(where) if where else runs)
 
 
 def error(
@@ -55,7 +56,7 @@ def error(
     estimator: str = "refined",
     where: str = "",
 ) -> dict[str, Any]:
-    """Return the row of `compare.comparisons` of one error, width 10. where: which runs."""
+    """Return the row of `comparisons.comparisons_of` of one error, width 10. where: which runs."""
     rows = compared(where)
     named = {"metric": metric, "method": method, "reference": over, "estimator": estimator}
     is_row = (rows[list(named)] == pd.Series(named)).all(axis=1) & rows["tested"]
@@ -65,19 +66,19 @@ def error(
 
 def verdict(method: str = "masked", over: str = "baseline", estimator: str = "refined") -> str:
     """Return the verdict on both errors that decide."""
-    rows = [error(metric, method, over, estimator) for metric in compare.JUDGING_METRICS]
-    return compare.overall([row["verdict"] for row in rows])
+    rows = [error(metric, method, over, estimator) for metric in comparisons.JUDGING_METRICS]
+    return comparisons.verdict_of(pd.DataFrame(rows))
 
 
 def of_controls() -> list[str]:
     """Return the verdicts on masks against each control without segmentation."""
-    return [verdict(over=name) for name in compare.SEGMENTATION_FREE_CONTROLS]
+    return [verdict(over=name) for name in comparisons.SEGMENTATION_FREE_CONTROLS]
 
 
 def worth(choice: str, motion: str, split: str = "fields", where: str = "") -> dict[str, Any]:
     """Return ratio, low, high, below, n and verdict of the worth of one of 400 keypoints."""
     rows = read_table(f"{REAL}worth_runs").query("number == 400 and choice == @choice")
-    (row,) = worths.typical(rows.query(where) if where else rows).to_dict("records")
+    (row,) = worths.typical_worths(rows.query(where) if where else rows).to_dict("records")
     name = f"{motion}_{split}"
     ends = {end: row[f"{name}_{end}"] for end in ("low", "high", "below")}
     return {"ratio": row[name], **ends, "n": row["n"], "verdict": row["verdict"]}
@@ -86,14 +87,14 @@ def worth(choice: str, motion: str, split: str = "fields", where: str = "") -> d
 def few(
     choice: str, number: int, metric: str, estimator: str = "refined", over: str = "all"
 ) -> dict[str, Any]:
-    """Return the numbers of `compare.typical_ratio` for so many keypoints, and failed runs."""
+    """Return the numbers of `ratios.typical_ratio` for so many keypoints, and failed runs."""
     runs = read_table(f"{REAL}few_keypoints_runs").query("estimator == @estimator")
     chosen = runs.query("choice == @choice and number == @number")
     reference = runs.query("choice == @over and number in (0, @number)")
-    ratios = compare.ratios(chosen, reference, metric)
+    of_streets = ratios.ratios_of(chosen, reference, metric)
     keypoints = chosen["keypoints"].mean()
     failed = int(chosen["failed"].sum())
-    return compare.typical_ratio(ratios) | {"keypoints": keypoints, "failed": failed}
+    return ratios.typical_ratio(of_streets) | {"keypoints": keypoints, "failed": failed}
 
 
 def audit(row: str, quantity: str, metric: str = "", estimator: str = "") -> dict[str, Any]:
@@ -116,7 +117,7 @@ def of_few(choice: str, number: int, column: str, name: str = f"{REAL}few_keypoi
 def of_rendered(metric: str) -> str:
     """Return an error of 200 spread keypoints over that of all in the embedded world."""
     text = of_few("spread", 200, f"{metric}, refined estimator", "few_keypoints")
-    return text.partition(",")[0]
+    return re.sub(r"\).*", ")", text)
 
 
 def commands() -> dict[str, Any]:

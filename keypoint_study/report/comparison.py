@@ -1,4 +1,4 @@
-"""Figures and tables of `compare.comparisons`.
+"""Figures and tables of `comparisons.comparisons_of` and of the errors beside them.
 
 They compare masks with all keypoints, with controls and with masks from other sources.
 """
@@ -10,24 +10,61 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
-from keypoint_study import best_width, compare
-from keypoint_study.errors import ERRORS
+from keypoint_study import best_width, comparisons, ratios
+from keypoint_study.comparisons import BROUGHT
 from keypoint_study.jobs import ESTIMATORS
+from keypoint_study.path_errors import ERRORS
 from keypoint_study.report import style, texts
-from keypoint_study.report.style import BASELINE, MASKED
-from keypoint_study.sources import UNMASKED
+from keypoint_study.report.style import BASELINE, COLUMN_WIDTH, MASKED, PAGE_WIDTH, Artefact
+from keypoint_study.verdicts import LEVEL, MIN_SEQUENCES
 
-BROUGHT = ("masked", *UNMASKED)  # methods of what a user brings; the others are controls
 REACHES = (2, 4, 8, 16, 64)  # of the figure's axis, which goes from 1 / reach to reach
-# columns of the failed runs of a method and of its reference, "2 of 40"
-FAILED = {"failed runs": "failed", "failed runs of the reference": "reference_failed"}
-NEUTRAL_ESTIMATORS = ESTIMATORS | {"thesis": "vote of all points"}  # for a table in another paper
+SHOWN = (*comparisons.JUDGING_METRICS, "rmse")  # the last one as the thesis measures it
 CHOICES = {"best": "best width", "left_out": "left-out width", "fixed": "one width for all"}
+_INTERVAL = (
+    "typical ratio of the sequences (the median of the means of all pairs, on logarithms), from "
+    f"{MIN_SEQUENCES} sequences on with its {LEVEL} % interval (Wilcoxon's signed-rank test)"
+)
+# {name: (title, caption)}
+CAPTIONS = {
+    "figure": (
+        "Masks and controls",
+        "A ratio is an error divided by that of all keypoints under the same estimator: below 1 is "
+        f"better. Grey dots are sequences, the diamond is the {_INTERVAL}, the bar with end caps. "
+        "Columns: the two errors that decide. One row of panels for each estimator, all with one "
+        "scale; a sequence beyond it is named at the edge, and an arrow marks an interval that is "
+        "cut. The mask of another frame and the rows below it do not use the classes in the frame. "
+        "If they do as well as masks, it is not the segmentation that helps. With several sources "
+        "of masks, the controls of each are in a figure of its own.",
+    ),
+    "ratios": (
+        "Masks and controls, in numbers",
+        f"Ratios of errors: {_INTERVAL}. An arrow behind an interval says that all of it lies below "
+        "or above 1. The verdict is that of both errors that decide: aligned ATE and rotational RPE "
+        "over one frame. In a failed run, a step turns wrongly or goes backwards; “failures” "
+        "compares how many sequences have more of them.",
+    ),
+    "errors": (
+        "Every sequence",
+        "The two errors that decide, for each estimator: mean and standard deviation over the "
+        "repetitions (none if it is 0 in these digits). The lowest mean of a sequence is bold; a "
+        "smaller difference than the deviations may be chance. With several sources of masks, the "
+        "controls stand in the table of ratios only.",
+    ),
+    "widths": (
+        "A fair choice of width",
+        "Ratios of errors to all keypoints with the best width of each sequence (chosen by its error "
+        "there), with the width chosen on the other sequences, and with one width for all. The row "
+        "“all sequences” has the typical ratio with its interval. If all widths are repeated, two "
+        "columns show how much is chance: the best width of one repetition evaluated in the other "
+        "repetitions, and how often two repetitions agree on the best width. The choices share data, "
+        "so the intervals of the chosen widths are too narrow.",
+    ),
+}
 
 
-def figure_comparison(table: pd.DataFrame) -> Figure:
+def figure_of_ratios(table: pd.DataFrame, source: str = "", width: float = PAGE_WIDTH) -> Artefact:
     """Draw the ratios of masks, other masks and controls to all keypoints.
 
     Grey dots are the sequences, the coloured mark is their typical ratio with its interval. The
@@ -35,23 +72,51 @@ def figure_comparison(table: pd.DataFrame) -> Figure:
     one scale, which shows nine of ten sequences, and three of four with masks. A sequence beyond it
     is named at the edge, and an arrow marks an interval that is cut. With several sources of masks
     it shows no controls.
+    source: show only this one, with its controls. width: inches; one column has the estimator that
+    decides alone, and its panels below each other.
     """
+    name, (title, caption) = "comparison", CAPTIONS["figure"]
+    if source:
+        table = table[table["source"].isin([source, ""])]
+        name, title = f"comparison-{source}", f"{title} of {source}"
     rows = _drawn(table)
-    rows = rows[rows["metric"].isin(compare.JUDGING_METRICS)]
-    sequences = compare.sequences_of(table)
+    rows = rows[rows["metric"].isin(comparisons.JUDGING_METRICS)]
+    is_wide = width > COLUMN_WIDTH
+    if not is_wide:
+        rows = rows[rows["estimator"].isin(rows.loc[rows["decides"], "estimator"])]
+    sequences = comparisons.sequences_of(table)
     orders = {name: list(part["label"].unique()) for name, part in rows.groupby("estimator")}
     estimators = [name for name in ESTIMATORS if name in orders]
-    metrics = [name for name in compare.JUDGING_METRICS if (rows["metric"] == name).any()]
-    heights = [0.8 + 0.33 * len(orders[name]) for name in estimators]  # of the panels, inches
+    metrics = [name for name in comparisons.JUDGING_METRICS if (rows["metric"] == name).any()]
+    shown = list(product(estimators, metrics))
+    columns, step = 1, 0.22  # inches from row to row
+    if is_wide:
+        columns, step = len(metrics), 0.33
+    heights = [0.8 + step * len(orders[estimator]) for estimator, _ in shown[::columns]]
     figure, axes = style.new_figure(
-        len(estimators),
-        len(metrics),
+        len(heights),
+        columns,
         squeeze=False,
         sharex=True,
         sharey="row",
         height=0.7 + sum(heights),
+        width=width,
         height_ratios=heights,
     )
+    reach = _reach(rows, sequences)
+    for panel, (estimator, metric) in zip(axes.flat, shown, strict=True):
+        of_panel = rows[(rows["estimator"] == estimator) & (rows["metric"] == metric)]
+        _draw_ratios(panel, of_panel, orders[estimator], sequences, reach)
+        panel.set_title(comparisons.METRICS[metric])
+    for panel, (estimator, _) in zip(axes[:, 0], shown[::columns], strict=True):
+        panel.set_ylabel(ESTIMATORS[estimator])
+    for panel in axes[-1]:
+        panel.set_xlabel(f"ratio to all keypoints{' (left of 1: lower)' * is_wide}", fontsize=8)
+    return Artefact(name, title, caption, figure)
+
+
+def _reach(rows: pd.DataFrame, sequences: list[str]) -> float:
+    """Return the largest ratio of the figure's axis."""
     distances = rows[sequences].astype(float).map(np.log).abs()
     brought = distances[rows["method"].isin(BROUGHT)].stack()
     wide_enough = [
@@ -60,17 +125,7 @@ def figure_comparison(table: pd.DataFrame) -> Figure:
         if (distances.stack() < np.log(reach)).mean() >= 0.9
         and (brought < np.log(reach)).mean() >= 0.75
     ]
-    reach = min(wide_enough, default=REACHES[-1])
-    for panels, estimator in zip(axes, estimators, strict=True):
-        panels[0].set_ylabel(ESTIMATORS[estimator])
-        for panel, metric in zip(panels, metrics, strict=True):
-            of_panel = rows[(rows["estimator"] == estimator) & (rows["metric"] == metric)]
-            _draw_ratios(panel, of_panel, orders[estimator], sequences, reach)
-    for panel, metric in zip(axes[0], metrics):
-        panel.set_title(compare.METRICS[metric])
-    for panel in axes[-1]:
-        panel.set_xlabel("ratio to all keypoints (left of 1: lower)", fontsize=8)
-    return figure
+    return min(wide_enough, default=REACHES[-1])
 
 
 def _draw_ratios(
@@ -113,7 +168,7 @@ def _draw_ratios(
 
 
 def _drawn(table: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows of `compare.comparisons` for figures and tables of errors."""
+    """Return the rows of `comparisons_of` for figures and tables of errors."""
     rows = table[table["shown"] & (table["reference"] == "baseline")]
     rows = rows[rows["method"] != "baseline"]
     sources_of_masks = rows.loc[rows["method"] == "masked", "source"]
@@ -122,70 +177,21 @@ def _drawn(table: pd.DataFrame) -> pd.DataFrame:
     return rows
 
 
-def table_summary(table: pd.DataFrame) -> pd.DataFrame:
-    """Return one row for each source: the answer of a study, from `compare.comparisons`.
+def table_of_ratios(rows: pd.DataFrame) -> Artefact:
+    """Return rows of `comparisons_of` for readers: one row for each pair of methods and estimator.
 
-    The columns are the mean number of keypoints that the source leaves and that of all, the ratio
-    of each judging metric, the verdict, the estimator that these are of, failed runs (those of
-    another estimator stand behind its name), and the control that does not use the classes in the
-    frame and has the lowest ratio of the first judging metric.
+    A ratio is a text, "1.09 (0.98-1.32)", see `texts.short`. The verdict is that of all judging
+    metrics. "failures" is the verdict on the failed runs.
     """
-    table = table[table["tested"] & (table["reference"] == "baseline")]
-    total = table.loc[table["decides"] & (table["method"] == "baseline"), "keypoints"].mean()
-    brought = table[table["method"].isin(BROUGHT)]
-    others = brought[brought["metric"].isin(compare.JUDGING_METRICS)]
-    controls = table[table["decides"] & table["method"].isin(compare.SEGMENTATION_FREE_CONTROLS)]
-    rows = []
-    for source, pair in brought[brought["decides"]].groupby("source", sort=False):
-        first = pair.iloc[0]
-        row = {
-            "source": source,
-            "keypoints": f"{first['keypoints']:.0f} instead of {total:.0f}",
-            **{compare.METRICS[line["metric"]]: texts.short(line) for _, line in pair.iterrows()},
-            "verdict": compare.overall(pair["verdict"]),
-            "estimator": ESTIMATORS[first["estimator"]],
-        }
-        of_source = others[
-            (others["source"] == source) & (others["estimator"] != first["estimator"])
-        ]
-        of_others = of_source.drop_duplicates("estimator")
-        for name, column in FAILED.items():
-            counts = zip(of_others["estimator"], of_others[column], strict=True)
-            named = [f"{ESTIMATORS[other]} {count}" for other, count in counts]
-            row[name] = "; ".join([first[column], *named])
-        if first["method"] == "paths":
-            row["keypoints"] = ""
-        of_metric = controls[controls["metric"] == first["metric"]]
-        of_source = of_metric[of_metric["source"] == source]
-        for _, best in of_source.nsmallest(1, "ratio").iterrows():
-            row["best control"] = f"{compare.METHODS[best['method']]} {texts.number(best['ratio'])}"
-        rows.append(row)
-    return pd.DataFrame(rows)
-
-
-def table_comparison(table: pd.DataFrame) -> pd.DataFrame:
-    """Return the ratios of each method to all keypoints, and of masks to each control.
-
-    It has one column a metric. A ratio is a text, "1.09 (0.98-1.32)". Beside each judging metric
-    stand the number of sequences with a ratio above 1, the geometric mean with its interval, and
-    the ratio that these sequences could show. The last columns are the verdict on all judging
-    metrics (`compare.overall`), the failed runs of the method and of its reference, and each
-    sequence's ratio of the first metric.
-    """
-    rows = table[table["shown"] & (table["method"] != "baseline")]
-    numbers = rows["keypoints"].round().astype("Int64")  # missing for paths of another system
-    rows = rows.assign(keypoints=numbers, last=rows["reference"] != "baseline")
-    rows = rows.sort_values("last", kind="stable")
-    sequences = compare.sequences_of(table)
+    rows = rows[(rows["method"] != "baseline") & rows["metric"].isin(SHOWN)]
     keys = ["estimator", "source", "method", "dilation_width", "reference_source", "reference"]
     lines = []
     for _, pair in rows.groupby(keys, dropna=False, sort=False):
         first = pair.iloc[0]
-        over = compare.METHODS[first["reference"]]
+        over = comparisons.METHODS[first["reference"]]
         if first["reference_source"] not in ("", first["source"]):
             over = f"{first['reference_source']}: {over}"
-        judging = pair[pair["metric"].isin(compare.JUDGING_METRICS)]
-        by_sequence = first[sequences].dropna().map(texts.number)
+        judging = pair[pair["metric"].isin(comparisons.JUDGING_METRICS)]
         lines.append(
             {
                 "estimator": ESTIMATORS[first["estimator"]],
@@ -193,56 +199,64 @@ def table_comparison(table: pd.DataFrame) -> pd.DataFrame:
                 "number": first["keypoints"],
                 "over": over,
                 "sequences": pair["n"].max(),
-                **_ratios_and_counts(pair),
-                "verdict": compare.overall(judging["verdict"]),
-                **{name: first[column] for name, column in FAILED.items()},
-                **by_sequence.add_prefix("sequence "),
+                **{
+                    comparisons.METRICS[row["metric"]]: texts.short(row)
+                    for _, row in pair.iterrows()
+                },
+                "verdict": comparisons.verdict_of(judging),
+                "failed runs": first["failed"],
+                "failed runs of the reference": first["reference_failed"],
+                "failures": first["failures_verdict"],
             }
         )
-    shown = pd.DataFrame(lines)
-    last = ["verdict", *FAILED, *(f"sequence {name}" for name in sequences)]
-    others = [name for name in shown if name not in last]
-    return shown.reindex(columns=[*others, *last])
+    table = pd.DataFrame(lines)
+    if lines:
+        # missing for paths of another system
+        table["number"] = table["number"].round().astype("Int64")
+    return Artefact("comparison", *CAPTIONS["ratios"], table)
 
 
-def _ratios_and_counts(pair: pd.DataFrame) -> dict[str, Any]:
-    """Return {name of the metric: ratio as a text} for two methods, which have one row a metric.
-
-    Behind a judging metric stand "6 of 8" above 1, the geometric mean and the detectable ratio.
-    """
-    cells: dict[str, Any] = {}
-    for _, row in pair.iterrows():
-        name = compare.METRICS[row["metric"]]
-        cells[name] = texts.short(row)
-        if row["metric"] in compare.JUDGING_METRICS:
-            cells[f"{name}: above 1"] = f"{row['above']} of {row['n']}"
-            mean = {end: row[f"mean_{end}"] for end in ("low", "high")}
-            cells[f"{name}: geometric mean"] = texts.short({"ratio": row["mean"], **mean})
-            cells[f"{name}: detectable"] = f"{row['detectable']:.2f}"
-    return cells
+def ratios_for_paper(table: pd.DataFrame) -> pd.DataFrame:
+    """Return what a paper shows of `comparisons_of`: ratios to all keypoints of both errors."""
+    rows = all_of(table[table["reference"] == "baseline"])
+    shown = table_of_ratios(rows).content
+    columns = ["estimator", "keypoints", *comparisons.JUDGING_METRICS.values(), "failed runs"]
+    return shown.filter(columns)
 
 
-def table_errors(table: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
+def long_table_of_ratios(table: pd.DataFrame) -> Artefact:
+    """Return `comparisons_of` for programs."""
+    title, caption = CAPTIONS["ratios"]
+    rows = table.assign(far_off=table["far_off"].map(" ".join))
+    return Artefact("ratios", title, caption, rows, for_programs=True)
+
+
+def all_of(table: pd.DataFrame) -> pd.DataFrame:
+    """Return the rows of `comparisons_of` of the tested width, those to all keypoints first."""
+    rows = table[table["shown"]]
+    return rows.sort_values("reference", key=lambda name: name != "baseline", kind="stable")
+
+
+def table_of_errors(table: pd.DataFrame, runs: pd.DataFrame) -> Artefact:
     """Return the errors of the methods of the figure and of all keypoints, one column a sequence.
 
     There is a row for each judging metric, estimator and method. A cell has the mean and the
     standard deviation over the repetitions, "0.0103 ± 0.0021", if it is not 0. The lowest mean of a
     sequence is bold, as Markdown has it: "**0.0103 ± 0.0021**".
     """
-    labels = [compare.METHODS["baseline"], *_drawn(table)["label"].unique()]
-    runs = runs.assign(label=compare.labels(runs))
+    labels = [comparisons.METHODS["baseline"], *_drawn(table)["label"].unique()]
+    runs = runs.assign(label=comparisons.labels(runs))
     parts = {}
-    for metric, estimator in product(compare.JUDGING_METRICS, NEUTRAL_ESTIMATORS):
+    for metric, estimator in product(comparisons.JUDGING_METRICS, ESTIMATORS):
         rows = runs[runs["estimator"] == estimator].dropna(subset=[metric])
         errors = rows.groupby(["label", "sequence"])[metric]
         means = errors.mean().unstack().reindex(labels)
         cells = errors.agg(_mean_and_spread).unstack().reindex(labels)
         cells = cells.mask(means == means.min(), "**" + cells + "**")
         error = ERRORS[metric]
-        parts[f"{error.title} ({error.unit})", NEUTRAL_ESTIMATORS[estimator]] = cells.dropna(
-            how="all"
-        )
-    return pd.concat(parts, names=["error", "estimator", "method"]).reset_index()
+        parts[f"{error.title} ({error.unit})", ESTIMATORS[estimator]] = cells.dropna(how="all")
+    shown = pd.concat(parts, names=["error", "estimator", "method"]).reset_index()
+    return Artefact("errors", *CAPTIONS["errors"], shown)
 
 
 def _mean_and_spread(errors: pd.Series) -> str:
@@ -256,7 +270,7 @@ def _mean_and_spread(errors: pd.Series) -> str:
     return f"{mean:.{digits}f} ± {deviation}"
 
 
-def table_widths(runs: pd.DataFrame) -> pd.DataFrame:
+def table_of_widths(runs: pd.DataFrame) -> Artefact:
     """Return the ratios of errors to all keypoints with three choices of the width, by sequence.
 
     The choices are the best, the left-out and the fixed width. The last rows of each source have
@@ -264,18 +278,19 @@ def table_widths(runs: pd.DataFrame) -> pd.DataFrame:
     that of failed runs.
     """
     tables = {}
-    for source in compare.sources(runs) or [""]:
-        of_source = compare.of_source(runs, source)
-        masked = compare.of_method(of_source, "masked")
+    for source in comparisons.sources(runs) or [""]:
+        of_source = comparisons.of_source(runs, source)
+        masked = comparisons.of_method(of_source, "masked")
         if masked["dilation_width"].nunique() > 1:
-            tables[source] = _widths(masked, compare.of_method(of_source, "baseline"))
-    if len(compare.sources(runs)) > 1 and tables:
-        return pd.concat(tables, names=["masks"]).reset_index("masks")
-    return next(iter(tables.values()), pd.DataFrame())
+            tables[source] = _widths(masked, comparisons.of_method(of_source, "baseline"))
+    table = next(iter(tables.values()), pd.DataFrame())
+    if len(comparisons.sources(runs)) > 1 and tables:
+        table = pd.concat(tables, names=["masks"]).reset_index("masks")
+    return Artefact("widths", *CAPTIONS["widths"], table)
 
 
 def _widths(masked: pd.DataFrame, baseline: pd.DataFrame) -> pd.DataFrame:
-    """Return `table_widths` of one source."""
+    """Return `table_of_widths` of one source."""
     chosen = best_width.chosen_widths(masked, baseline)
     stability = best_width.stability(masked, baseline)
     metrics = [name for name in ("rmse", "se3") if name in masked]
@@ -283,17 +298,17 @@ def _widths(masked: pd.DataFrame, baseline: pd.DataFrame) -> pd.DataFrame:
     for choice, label in CHOICES.items():
         rows = best_width.of_chosen_width(masked, chosen[choice])
         for metric in metrics:
-            ratios = compare.ratios(rows, baseline, metric)
-            name = f"{label}: {compare.METRICS[metric]}"
-            columns[name] = ratios
-            failed[name] = compare.count_failed(rows)
+            by_sequence = ratios.ratios_of(rows, baseline, metric)
+            name = f"{label}: {comparisons.METRICS[metric]}"
+            columns[name] = by_sequence
+            failed[name] = ratios.count_failed(rows)
     columns["best width of one repetition, in the others: RMSE"] = stability["elsewhere"]
     table = pd.DataFrame(columns, index=chosen.index).dropna(axis=1, how="all")
     shown = table.map(texts.number, na_action="ignore").astype(object)
     means, lower = {}, {}
-    for name, ratios in table.items():
-        means[name] = texts.short(compare.typical_ratio(ratios))
-        lower[name] = f"{(ratios < 1).sum()} of {ratios.count()}"
+    for name, of_choice in table.items():
+        means[name] = texts.short(ratios.typical_ratio(of_choice))
+        lower[name] = f"{(of_choice < 1).sum()} of {of_choice.count()}"
     shown.loc["all sequences"] = means
     shown.loc["lower in"] = lower
     shown.loc["failed runs"] = failed

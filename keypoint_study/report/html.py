@@ -1,7 +1,6 @@
 """The HTML of figures, tables and texts, and the page of a study, which needs no network."""
 
 import importlib.metadata
-import json
 import platform
 import subprocess
 from contextlib import suppress
@@ -9,16 +8,15 @@ from pathlib import Path
 from typing import Any
 
 import mistune
+import pandas as pd
 from markupsafe import Markup
 
-from keypoint_study.report import texts
+from keypoint_study.report import style, texts
+from keypoint_study.report.style import Artefact
 from thesis_repro.running.provenance import ROOT
 
 PAGE = "index.html"
 ENDINGS = {"figure": (".svg", ".webp", ".pdf"), "table": (".csv", ".md", ".tex"), "text": (".md",)}
-# The figures, tables and texts of a study: dicts with kind ("figure", "table", "text"), name (of
-# the files), title and caption.
-ARTEFACTS = json.loads((Path(__file__).parent / "captions.json").read_text(encoding="utf-8"))
 OPENING = ("findings", "figure-comparison", "table-summary")  # ids of those at the top of a page
 ROWS_SHOWN = 36  # of a table; a longer one is linked
 # packages that affect the numbers most
@@ -37,28 +35,27 @@ DEFAULTS: dict[str, Any] = {"number": None, "makers": [], "thesis": {}, "left_ou
 DEFAULTS |= {"content": None, "details": None, "rows": 0, "markdown": None}
 
 
-def build_study(folder: Path, names: list[tuple[str, str]], **facts: Any) -> str:
-    """Return the page of a study as HTML.
-
-    names: (kind, name) of its files. facts: further values of the template, and the study itself.
-    """
-    described = []
-    for artefact in ARTEFACTS:
-        for kind, name in names:
-            # one artefact describes the figures of all sequences
-            base, _, sequence = name.partition("-")
-            if (kind, base) == (artefact["kind"], artefact["name"]):
-                title = f"{artefact['title']} {sequence}".strip()
-                described.append(describe(folder, artefact | {"name": name, "title": title}))
+def page_of(artefacts: list[dict[str, Any]], **facts: Any) -> str:
+    """Return the page of a study as HTML. artefacts: of `described`. facts: of the template."""
     compared = dict.fromkeys(facts["kinds"][source.kind] for source in facts["study"].sources)
+    title = f"{' and '.join(compared).capitalize()}, compared with all keypoints"
     return texts.render(
-        "study.html.j2",
-        title=f"{' and '.join(compared).capitalize()}, compared with all keypoints",
-        artefacts=described,
-        notebooks={},
-        made=made_with() | made_on(),
-        **facts,
+        "study.html.j2", title=title, artefacts=artefacts, made=versions() | machine(), **facts
     )
+
+
+def described(artefact: Artefact, files: list[str]) -> dict[str, Any]:
+    """Return the values that the template needs to show an artefact. files: their names."""
+    content: Any = artefact.content
+    values = {**artefact._asdict(), "files": files, "details": None, "rows": 0}
+    if isinstance(content, pd.DataFrame):
+        shown = "" if artefact.for_programs else style.markdown(content).replace(r"\*\*", "**")
+        return {**values, "kind": "table", "rows": len(content), "content": from_markdown(shown)}
+    if isinstance(content, str):
+        first, heading, rest = content.partition("\n## ")
+        details = from_markdown(f"## {rest}") if heading else None
+        return {**values, "kind": "text", "content": from_markdown(first), "details": details}
+    return {**values, "kind": "figure"}
 
 
 def describe(folder: Path, artefact: dict[str, Any]) -> dict[str, Any]:
@@ -108,16 +105,16 @@ def from_markdown(text: str) -> Markup:
     return Markup(convert(text))
 
 
-def made_with() -> dict[str, Any]:
+def versions() -> dict[str, Any]:
     """Return the packages of the results, with their versions."""
-    versions = {}
+    found = {}
     for name in PACKAGES:
         with suppress(importlib.metadata.PackageNotFoundError):  # a study needs no TensorFlow
-            versions[name] = importlib.metadata.version(name)
-    return {"packages": versions}
+            found[name] = importlib.metadata.version(name)
+    return {"packages": found}
 
 
-def made_on() -> dict[str, Any]:
+def machine() -> dict[str, Any]:
     """Return the Python, the machine and the commit of the results."""
     facts = {
         "python": platform.python_version(),

@@ -1,20 +1,22 @@
 """The results of a study with the user's masks: findings, figures, tables and a page.
 
-Tables are also written as LaTeX and figures as PDF, for use in a paper.
+Figures are also written as PDF, across a page and in one column, and tables as LaTeX.
 """
 
-import re
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
-from matplotlib.figure import Figure
 
-from keypoint_study import compare, controls, runner
+from keypoint_study import comparisons, controls, runner
 from keypoint_study.jobs import ESTIMATORS
 from keypoint_study.plan import RUNS, Study
-from keypoint_study.report import comparison, findings, html, paths, style, worth
+from keypoint_study.report import comparison, html, latex, style, worths
+from keypoint_study.report.findings import findings_of
+from keypoint_study.report.paths import figure_of_paths
+from keypoint_study.report.style import COLUMN_WIDTH, PAGE_WIDTH, Artefact
 from keypoint_study.sources import KINDS, UNMASKED, FileMasks, Source, own_calls
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.data.trajectories import write_kitti_poses, write_tum
@@ -29,8 +31,6 @@ from thesis_repro.running.files import write_text
 
 PATHS = "paths"  # folder of the estimated paths
 DRAWN = ("masked", "keypoints")  # methods of what a user brings that acts on frames
-NO_DEVIATION = "Without $\\pm$: the standard deviation is 0 in these digits, or there is one run."
-FIT = 4  # columns of errors across a page, in letters that can be read
 
 
 @style.applied()
@@ -39,76 +39,113 @@ def write(
     runs: pd.DataFrame,
     folder: Path,
     warnings: Collection[str] = (),
-    worths: pd.DataFrame | None = None,
+    of_worths: pd.DataFrame | None = None,
 ) -> Path:
     """Write the findings, figures, tables and page of a `Study` into a folder.
 
-    Returns the page's path. warnings: lines for the top of the page. worths: of `Study.worths`.
+    Returns the page's path. warnings: lines for the top of the page. of_worths: of `Study.worths`.
     """
     # `thesis-repro synthesize` leaves a record beside the KITTI folder of an embedded world
     embedded = "train_images" in (provenance.record(study.kitti.resolve().parent) or {})
     data = "embedded world (rendered)" if embedded else f"KITTI folder {study.kitti.name}"
     changed = {source.name: _changed(source) for source in study.sources}
-    masks = [
+    brought = [
         f"{source.name} ({KINDS[source.kind]}{changed[source.name]})" for source in study.sources
     ]
-    note = one_line(f"odometry: {data}; compared: {', '.join(masks)}")
+    note = one_line(f"odometry: {data}; compared: {', '.join(brought)}")
     write_paths(study, runs, folder)
-    figures = {}
-    if runs["method"].isin(DRAWN).any():
-        figures["sources"] = figure_sources(study, runs)
-    for sequence in study.opened:
-        figures[f"paths-{sequence.name}"] = figure_paths(study, runs, sequence, folder)
-    # for texts and tables
-    runs = runs.assign(sequence=runs["sequence"].map(one_line))
-    table = compare.comparisons(runs)
-    write_text(folder / "findings.md", findings.text(runs, table, note, embedded))
-    figures = {"comparison": comparison.figure_comparison(table), **figures}
-    if worths is not None:
-        figures["worth"] = worth.figure(worths)
-    for name, figure in figures.items():
-        style.write_figure(figure, folder / f"{name}.pdf")
-    numbers = {
-        "summary": pd.concat([comparison.table_summary(table), _failed(study, runs)]),
-        "comparison": comparison.table_comparison(table),
-        "widths": comparison.table_widths(runs),
-        "errors": comparison.table_errors(table, runs),
-    }
-    if worths is not None:
-        numbers["worth"] = worth.table(worths)
-        provenance.write_table(folder / "worth_runs.csv", worths)
-    in_latex = {name: latex(rows) for name, rows in numbers.items()}
-    in_latex["errors"] = latex_errors(numbers["errors"], study.repetitions)
-    if len(numbers["summary"]):  # one column a source fits into a column of text
-        by_source = numbers["summary"].set_index("source").T.rename_axis("source")
-        in_latex["summary"] = latex(by_source.reset_index())
-    for name, text in in_latex.items():
-        write_text(folder / f"{name}.tex", f"% {note}\n{text}")
-    numbers["runs"] = runs.round(6)  # hundreds of pages in LaTeX
-    names = style.save_all(figures, numbers, folder, note)
-    widths = sorted(runs["dilation_width"].dropna().astype(int).unique())
-    text = html.build_study(
-        folder,
-        [("text", "findings"), *names],
+    named = runs.assign(sequence=runs["sequence"].map(one_line))  # for texts and tables
+    table = comparisons.comparisons_of(named)
+    findings = Artefact(
+        "findings", "What the runs show", "", findings_of(named, table, note, embedded)
+    )
+    saved = [(findings, style.save(findings, folder, note))]
+    for width in (COLUMN_WIDTH, PAGE_WIDTH):
+        for figure in figures_of(study, runs, table, of_worths, folder, width):
+            if width == COLUMN_WIDTH:
+                # a tight box would make it wider or narrower than the column
+                style.write_figure(
+                    figure.content, folder / f"{figure.name}-column.pdf", bbox_inches=None
+                )
+                plt.close(figure.content)
+                continue
+            style.write_figure(figure.content, folder / f"{figure.name}.pdf")
+            files = style.save(figure, folder, note)
+            saved.append((figure, [*files, f"{figure.name}.pdf", f"{figure.name}-column.pdf"]))
+    for shown, for_paper in tables_of(named, table, of_worths):
+        files = style.save(shown, folder, note)
+        if files and for_paper is not None:
+            text = latex.latex_of(shown, for_paper)
+            write_text(folder / f"{shown.name}.tex", f"% {note}\n{text}")
+            files.append(f"{shown.name}.tex")
+        saved.append((shown, files))
+    text = html.page_of(
+        [html.described(artefact, files) for artefact, files in saved if files],
         study=study,
+        failed=[source.name for source in study.sources if source.name not in set(runs["source"])],
         warnings=warnings,
         embedded=embedded,
         kinds=KINDS,
         estimators=ESTIMATORS,
         line_width=controls.LINE_WIDTH,
         changed=changed,
-        widths=widths,
+        widths=sorted(runs["dilation_width"].dropna().astype(int).unique()),
     )
     write_text(folder / html.PAGE, text)
     return folder / html.PAGE
 
 
+def figures_of(
+    study: Study,
+    runs: pd.DataFrame,
+    table: pd.DataFrame,
+    of_worths: pd.DataFrame | None,
+    folder: Path,
+    width: float,
+) -> Iterator[Artefact]:
+    """Draw the figures of a study, of a width in inches.
+
+    table: `comparisons_of` the runs.
+    """
+    yield comparison.figure_of_ratios(table, width=width)
+    controlled = table[table["method"].isin(comparisons.SEGMENTATION_FREE_CONTROLS)]
+    masked = table.loc[table["method"] == "masked", "source"].unique()
+    if len(masked) > 1:
+        for source in controlled["source"].unique():
+            yield comparison.figure_of_ratios(table, source, width)
+    if runs["method"].isin(DRAWN).any():
+        yield figure_of_sources(study, runs, width)
+    if of_worths is not None:
+        yield worths.figure_of_worths(of_worths, width=width)
+    for sequence in study.opened:
+        yield figure_of_sequence(study, runs, sequence, folder, width)
+
+
+def tables_of(
+    runs: pd.DataFrame, table: pd.DataFrame, of_worths: pd.DataFrame | None
+) -> Iterator[tuple[Artefact, pd.DataFrame | None]]:
+    """Return the tables of a study, each with what a paper shows of it (None: nothing)."""
+    errors = comparison.table_of_errors(table, runs)
+    yield errors, errors.content
+    widths = comparison.table_of_widths(runs)
+    yield widths, widths.content
+    if of_worths is not None:
+        shown = worths.table_of_worths(of_worths)
+        yield shown, worths.for_paper(shown.content)
+        caption = "The worth of each choice on every sequence."
+        yield Artefact("worth_runs", "Every worth", caption, of_worths, True), None
+    yield comparison.long_table_of_ratios(table), comparison.ratios_for_paper(table)
+    caption = "Settings, errors, failed and flagged frames."
+    yield Artefact("runs", "Every run", caption, runs.round(6), True), None
+
+
 @style.applied()
-def write_worths(study: Study, worths: pd.DataFrame, folder: Path) -> Path:
+def write_worths(study: Study, of_worths: pd.DataFrame, folder: Path) -> Path:
     """Write the worths of a study without ground truth, which has no errors; return the table."""
     note = one_line(f"KITTI folder {study.kitti.name}, without ground truth")
-    provenance.write_table(folder / "worth_runs.csv", worths)
-    style.save_all({"worth": worth.figure(worths)}, {"worth": worth.table(worths)}, folder, note)
+    provenance.write_table(folder / "worth_runs.csv", of_worths)
+    for artefact in (worths.figure_of_worths(of_worths), worths.table_of_worths(of_worths)):
+        style.save(artefact, folder, note)
     return folder / "worth.md"
 
 
@@ -128,39 +165,6 @@ def write_paths(study: Study, runs: pd.DataFrame, folder: Path) -> None:
             write_tum(folder / PATHS / "tum" / name / f"{run}.txt", poses, sequence.times)
 
 
-def latex(table: pd.DataFrame) -> str:
-    """Return a table as LaTeX, no wider than a column of text; it needs booktabs and graphicx.
-
-    A text between ** is bold.
-    """
-    if table.empty:
-        return ""
-    text = table.to_latex(index=False, na_rep="", escape=True, float_format="{:g}".format)
-    text = re.sub(r"\*\*(.*?)\*\*", r"\\textbf{\1}", text).replace("±", r"$\pm$")
-    width = r"\ifdim\width>\linewidth\linewidth\else\width\fi"
-    return f"\\resizebox{{{width}}}{{!}}{{%\n{text}}}\n"
-
-
-def latex_errors(table: pd.DataFrame, repetitions: int = 1) -> str:
-    """Return `comparison.table_errors` as LaTeX: tables of at most FIT sequences.
-
-    Each table has one error and one estimator, which stand in a line above it. A note below it
-    tells of means without a deviation, if there are several repetitions.
-    """
-    parts = []
-    for (error, estimator), rows in table.groupby(["error", "estimator"], sort=False):
-        sequences = rows.columns.drop(["error", "estimator", "method"])
-        for first in range(0, len(sequences), FIT):
-            columns = ["method", *sequences[first : first + FIT]]
-            text = f"\\noindent {error}, {estimator}\\par\n{latex(rows[columns])}"
-            if repetitions > 1 and not rows[columns[1:]].map(lambda cell: "±" in str(cell)).all(
-                axis=None
-            ):
-                text += f"\\par\\noindent {NO_DEVIATION}\\par\n"
-            parts.append(text)
-    return "\n".join(parts)
-
-
 def shown_masks(study: Study) -> list[tuple[Sequence, list[FileMasks]]]:
     """Return each sequence with the masks of each source, at the `shown_width`."""
     sources = [source for source in study.sources if source.kind not in UNMASKED]
@@ -170,12 +174,12 @@ def shown_masks(study: Study) -> list[tuple[Sequence, list[FileMasks]]]:
     ]
 
 
-def figure_sources(study: Study, runs: pd.DataFrame) -> Figure:
+def figure_of_sources(study: Study, runs: pd.DataFrame, width: float = PAGE_WIDTH) -> Artefact:
     """Draw the middle frame of the first sequence that has such runs, one row a source.
 
     A row shows the source's label map (or the frame, if there is none), its mask and the kept
     keypoints, so that a person sees which masks are inverted or lie elsewhere. Own keypoints have
-    no mask. Sources whose runs failed are left out.
+    no mask. Sources whose runs failed are left out. width: inches.
     """
     drawn = runs[runs["method"].isin(DRAWN)]
     name = drawn["sequence"].iloc[0]
@@ -185,7 +189,10 @@ def figure_sources(study: Study, runs: pd.DataFrame) -> Figure:
     index = len(sequence) // 2
     frame = sequence.frame(index)
     label_maps = []
-    figure, axes = style.frame_panels(frame, len(sources), 3, 1.5 * style.PAGE_WIDTH)
+    columns, size = 3, 1.5 * width
+    if width <= COLUMN_WIDTH:
+        columns, size = 1, width
+    figure, axes = style.frame_panels(frame, 3 * len(sources) // columns, columns, size)
     for (first, second, third), source in zip(np.reshape(axes, (-1, 3)), sources, strict=True):
         style.show_image(first, frame, f"{source.name}: frame {index}")
         if source.kind == "keypoints":
@@ -204,31 +211,42 @@ def figure_sources(study: Study, runs: pd.DataFrame) -> Figure:
         third.scatter(*points.T, **style.KEYPOINT)
     if label_maps:
         style.class_legend(figure, *label_maps)
-    return figure
+    return Artefact(
+        "sources",
+        "The masks and keypoints",
+        "The middle frame of the first sequence. Each source has a row: its label map (or the frame, "
+        "if there is none), its mask, and the keypoints that the detector (Shi-Tomasi) finds inside "
+        "it. Own keypoints have no mask; points that lie elsewhere than corners hint at rows and "
+        "columns in the wrong order. A mask keeps keypoints where it is white: if that is where it "
+        "should discard them, the masks are inverted, and --invert turns them round.",
+        figure,
+    )
 
 
-def _failed(study: Study, runs: pd.DataFrame) -> pd.DataFrame:
-    """Return rows of the summary for sources without any run."""
-    names = [source.name for source in study.sources if source.name not in set(runs["source"])]
-    return pd.DataFrame({"source": names, "verdict": ["all runs failed"] * len(names)})
-
-
-def figure_paths(study: Study, runs: pd.DataFrame, sequence: Sequence, folder: Path) -> Figure:
+def figure_of_sequence(
+    study: Study, runs: pd.DataFrame, sequence: Sequence, folder: Path, width: float = PAGE_WIDTH
+) -> Artefact:
     """Draw the path with all keypoints and that of each source, shifted as for the RMSE."""
     widths = runs["dilation_width"]
     rows = runs[
         (runs["sequence"] == sequence.name)
         & (runs["repetition"] == 0)
-        & (runs["estimator"] == compare.judging_estimator(runs))
+        & (runs["estimator"] == comparisons.judging_estimator(runs))
         & runs["method"].isin(["baseline", "masked", *UNMASKED])
         & (widths.isna() | (widths == study.shown_width))
     ]
     shown = {}
     poses = runner.run_poses(rows, folder / RUNS)
     for row in rows.itertuples():
-        label = row.source or compare.METHODS[row.method]
+        label = row.source or comparisons.METHODS[row.method]
         shown[label] = metrics.shifted(poses[sequence.name, row.run], sequence.poses)
-    return paths.figure(shown, sequence.poses, f"sequence {sequence.name}")
+    return Artefact(
+        f"paths-{sequence.name}",
+        f"Paths of sequence {sequence.name}",
+        "All keypoints and each source (masks of the tested width), one run each, aligned with the "
+        "true path at frame 1 as for the RMSE.",
+        figure_of_paths(shown, sequence.poses, f"sequence {sequence.name}", width),
+    )
 
 
 def _changed(source: Source) -> str:

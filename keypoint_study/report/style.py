@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from textwrap import fill
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib
 import matplotlib.pyplot as plt
@@ -22,7 +22,7 @@ from keypoint_study.report.texts import in_markdown
 from thesis_repro.data.cityscapes import LABELS, colorize
 from thesis_repro.running.files import atomic, write_text
 
-PAGE_WIDTH = 7.2  # inches
+PAGE_WIDTH, COLUMN_WIDTH = 7.2, 3.5  # inches, of figures across a page and in one column of a paper
 NOTE_LETTERS = 22  # of a note, in an inch
 # Okabe and Ito's colours, distinguishable with any colour vision
 BLACK, ORANGE, SKY, GREEN = "#000000", "#e69f00", "#56b4e9", "#009e73"
@@ -50,6 +50,7 @@ SETTINGS: dict[Any, Any] = {
     "svg.fonttype": "none",
     "text.parse_math": False,  # names of files and sequences may contain dollar signs
     "svg.hashsalt": "thesis-repro",  # the same figure gives the same file
+    "pdf.fonttype": 42,  # TrueType: publishers refuse Type 3
     "savefig.dpi": 160,
     "figure.max_open_warning": 0,  # a study of many sources draws more than 20
 }
@@ -60,6 +61,20 @@ DIAGRAM = "drawn by the notebook; it does not depend on the data at hand"
 # style of keypoints on a frame
 KEYPOINT: dict[str, Any] = {"s": 2.5, "color": "#00e5a0", "linewidths": 0}
 EDGE_COLOR = (255, 140, 0)  # red, green, blue of edges on a frame
+
+
+class Artefact(NamedTuple):
+    """A figure, a table or a text in Markdown, and what a page says beside it.
+
+    name: of its files. content: a Figure, a DataFrame or a str. for_programs: whether it is a long
+    table, which a page only links.
+    """
+
+    name: str
+    title: str
+    caption: str
+    content: Any
+    for_programs: bool = False
 
 
 def use() -> None:
@@ -192,8 +207,8 @@ def ratio_axis(axis: Any, values: np.ndarray | list[float]) -> None:
     axis.set_minor_locator(NullLocator())
 
 
-def save_figure(figure: plt.Figure, folder: Path, name: str, note: str) -> None:
-    """Write folder/name.webp if the figure contains images, else folder/name.svg.
+def save_figure(figure: plt.Figure, folder: Path, name: str, note: str) -> str:
+    """Write folder/name.webp if the figure contains images, else folder/name.svg; return its name.
 
     The data note is at the foot of the figure, no wider than it, and in the file's metadata.
     """
@@ -225,15 +240,17 @@ def save_figure(figure: plt.Figure, folder: Path, name: str, note: str) -> None:
     write_figure(figure, folder / f"{name}{ending}", **options)
     # an earlier run may have written the other format
     (folder / f"{name}{other}").unlink(missing_ok=True)
+    return f"{name}{ending}"
 
 
 def write_figure(figure: plt.Figure, path: str | Path, **options: Any) -> None:
     """Write a figure in the format that the path's ending names, without a date."""
     ending = Path(path).suffix.lower()
+    tight: dict[str, Any] = {"bbox_inches": "tight", "pad_inches": 0.04}
     if ending in DATES:
         options["metadata"] = {DATES[ending]: None} | options.get("metadata", {})
     with atomic(path) as temporary:
-        figure.savefig(temporary, bbox_inches="tight", pad_inches=0.04, **options)
+        figure.savefig(temporary, **tight | options)
         if ending == ".svg":
             svg = temporary.read_text(encoding="utf-8")
             temporary.write_text(same_on_all_processors(svg), encoding="utf-8")
@@ -270,30 +287,35 @@ def save_table(table: pd.DataFrame, folder: Path, name: str, note: str) -> None:
 
     A text between ** is bold in Markdown.
     """
-    # spreadsheets take a text that begins so for a formula
-    cells = table.replace({r"^([=+@-])": r"'\1", r"\*\*": ""}, regex=True)
-    write_text(folder / f"{name}.csv", cells.to_csv(index=False, lineterminator="\n"))
+    save_csv(table, folder / f"{name}.csv")
     text = markdown(table).replace(r"\*\*", "**")
     write_text(folder / f"{name}.md", f"{text}\n{in_markdown(note)}\n")
 
 
-def save_all(
-    figures: dict[str, plt.Figure], tables: dict[str, pd.DataFrame], folder: Path, note: str
-) -> list[tuple[str, str]]:
-    """Write {name: figure} and {name: table}, except empty tables.
+def save_csv(table: pd.DataFrame, path: Path) -> None:
+    """Write a table as CSV."""
+    # spreadsheets take a text that begins so for a formula
+    cells = table.replace({r"^([=+@-])": r"'\1", r"\*\*": ""}, regex=True)
+    write_text(path, cells.to_csv(index=False, lineterminator="\n"))
 
-    Returns (kind, name) of each one that was written.
-    """
-    written = []
-    for name, figure in figures.items():
-        save_figure(figure, folder, name, note)
-        plt.close(figure)
-        written.append(("figure", name))
-    for name, table in tables.items():
-        if len(table):
-            save_table(table, folder, name, note)
-            written.append(("table", name))
-    return written
+
+def save(artefact: Artefact, folder: Path, note: str) -> list[str]:
+    """Write an artefact, and return the names of its files; an empty table has none."""
+    name, content = artefact.name, artefact.content
+    if isinstance(content, str):
+        write_text(folder / f"{name}.md", content)
+        return [f"{name}.md"]
+    if isinstance(content, pd.DataFrame):
+        if content.empty:
+            return []
+        if artefact.for_programs:
+            save_csv(content, folder / f"{name}.csv")
+            return [f"{name}.csv"]
+        save_table(content, folder, name, note)
+        return [f"{name}.csv", f"{name}.md"]
+    written = save_figure(content, folder, name, note)
+    plt.close(content)
+    return [written]
 
 
 def markdown(table: pd.DataFrame) -> str:

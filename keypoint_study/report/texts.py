@@ -3,7 +3,7 @@
 import os
 import re
 import shlex
-from math import ceil, log10
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -11,10 +11,11 @@ from urllib.parse import quote
 import pandas as pd
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from keypoint_study import compare
+from keypoint_study.ratios import side_of_one
 from thesis_repro.errors import one_line
 
-DIGITS = 2  # of a ratio that is not close to 1
+# behind an interval, by the side of 1 on which it lies
+MARKS = {-1: " ↓", 0: "", 1: " ↑"}
 LOADER = FileSystemLoader(Path(__file__).parent / "templates")  # others may add their folders
 TEMPLATES = Environment(
     loader=LOADER,
@@ -37,28 +38,22 @@ def render(template: str, **values: Any) -> str:
 
 
 def number(value: float) -> str:
-    """Return a ratio as text with two digits, or with more if it would look like 0 or 1."""
-    digits = DIGITS
-    distance = min(abs(value), abs(value - 1))
-    if 0 < distance < 0.5 * 10**-DIGITS:
-        digits = min(6, ceil(-log10(distance)) + 1)
-    return f"{value:.{digits}f}"
+    """Return a ratio as text, with two digits after the point."""
+    return f"{value:z.2f}"
 
 
-def short(row: dict[str, Any] | pd.Series) -> str:
+def short(row: Mapping[str, Any] | pd.Series) -> str:
     """Return "1.09 (0.98-1.32)" for a row with ratio, low and high.
 
-    Without an interval (low is missing) it is only the ratio.
+    An arrow behind it says that the whole interval is below or above 1, which two digits may not
+    show: "1.02 (1.00-1.08) ↑". Without an interval (low is missing) it is only the
+    ratio.
     """
-    mean = number(row["ratio"])
+    typical = number(row["ratio"])
     if pd.isna(row["low"]):
-        return mean
-    return f"{mean} ({number(row['low'])}-{number(row['high'])})"
-
-
-def ratio(row: dict[str, Any] | pd.Series) -> str:
-    """Return `short` with what the interval is: "1.09 (95 % CI 0.98-1.32)"."""
-    return short(row).replace("(", f"({compare.LEVEL} % CI ")
+        return typical
+    mark = MARKS[side_of_one(row["low"], row["high"])]
+    return f"{typical} ({number(row['low'])}-{number(row['high'])}){mark}"
 
 
 def in_markdown(text: object) -> str:

@@ -1,7 +1,7 @@
 """Ablations: the effect of each single setting of the odometry and of the masks (notebook 09).
 
-Every run differs from a reference run in one setting. The tables have the columns that `compare`
-needs.
+Every run differs from a reference run in one setting. The tables have the columns that
+`comparisons` needs.
 """
 
 from collections.abc import Callable, Iterable, Mapping

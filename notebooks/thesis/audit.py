@@ -2,7 +2,7 @@
 
 audit.json holds the rows. A measurement is one line of a row's numbers: notebook 09,
 `audit_of_tables` and `audit_of_data` make them, and `audit_table` joins them to the rows. Ratios
-come from `keypoint_study.compare`. Intervals of other means are those of Student's t over `n`
+come from `keypoint_study.ratios`. Intervals of other means are those of Student's t over `n`
 values: sequences unless said otherwise.
 """
 
@@ -13,14 +13,14 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from keypoint_study import compare
+from keypoint_study import comparisons, ratios
 
 ROWS = json.loads((Path(__file__).parent / "audit.json").read_text(encoding="utf-8"))["rows"]
 METRICS = {  # column of a table: its name in the audit
     "rmse": "RMSE",
     "mae": "MAE",
     "mean_keypoints": "keypoints",
-    "rotation": compare.METRICS["rotation"],
+    "rotation": comparisons.METRICS["rotation"],
     "in_turns": "rotation error in turns",
     "on_straights": "rotation error on straights",
     "se3": "aligned ATE",
@@ -44,7 +44,7 @@ def measurement(
     numbers = np.asarray(values, float).ravel()
     numbers = numbers[~np.isnan(numbers)]
     mean = numbers.mean() if len(numbers) else np.nan
-    low, high = compare.mean_interval(numbers)
+    low, high = ratios.mean_interval(numbers)
     texts = {"row": row, "quantity": quantity, "unit": unit}
     return {**texts, "value": mean, "low": low, "high": high, "n": len(numbers), **more}
 
@@ -61,14 +61,14 @@ def share(row: str, quantity: str, percentages: Any, **more: Any) -> dict[str, A
 
 
 def ratio(
-    row: str, quantity: str, ratios: Any, geometric_mean: bool = False, **more: Any
+    row: str, quantity: str, of_streets: Any, geometric_mean: bool = False, **more: Any
 ) -> dict[str, Any]:
     """Return one measurement for a row of the audit: the ratio over one ratio a sequence.
 
     It is the typical ratio, or the geometric mean.
     """
     names = ("mean", "mean_low", "mean_high") if geometric_mean else ("ratio", "low", "high")
-    typical = compare.typical_ratio(ratios)
+    typical = ratios.typical_ratio(of_streets)
     value, low, high = (typical[name] for name in names)
     return measurement(
         row, quantity, [], "ratio", value=value, low=low, high=high, n=typical["n"], **more
@@ -110,5 +110,5 @@ def clear_effects(table: pd.DataFrame) -> pd.DataFrame:
     Row 14, a largest over a smallest error, cannot be below 1 and is left out.
     """
     no_errors = ["", METRICS["mean_keypoints"], METRICS["fields"]]
-    ratios = table[(table["unit"] == "ratio") & ~table["metric"].isin(no_errors)]
-    return ratios[((ratios["low"] > 1) | (ratios["high"] < 1)) & (ratios["row"] != "14")]
+    lines = table[(table["unit"] == "ratio") & ~table["metric"].isin(no_errors)]
+    return lines[((lines["low"] > 1) | (lines["high"] < 1)) & (lines["row"] != "14")]

@@ -11,7 +11,7 @@ from typing import Any
 import pandas as pd
 from scipy.stats import binomtest
 
-from keypoint_study import compare
+from keypoint_study import comparisons, ratios
 from thesis import section_4_2
 from thesis.audit import METRICS, measurement, ratio, share
 from thesis.captions import REPORTED
@@ -44,27 +44,27 @@ def over(
     The number of keypoints hardly depends on the estimator, so it has one ratio. estimators: [""]
     for a table without them.
     """
-    ratios = []
+    lines = []
     for metric in (each for each in metrics if each in runs):
         for estimator in [""] if metric == "mean_keypoints" else estimators:
-            by_sequence = compare.ratios(of(runs, estimator), of(reference, estimator), metric)
-            ratios.append(
+            by_sequence = ratios.ratios_of(of(runs, estimator), of(reference, estimator), metric)
+            lines.append(
                 ratio(row, quantity, by_sequence, metric=METRICS[metric], estimator=estimator)
             )
-    return ratios
+    return lines
 
 
 def over_thesis(row: str, quantity: str, runs: pd.DataFrame, estimator: str) -> dict[str, Any]:
     """Return the ratio of an estimator's RMSE to that of the thesis's estimator."""
-    ratios = compare.ratios(of(runs, estimator), of(runs, "thesis"), "rmse")
-    return ratio(row, quantity, ratios, metric=METRICS["rmse"], estimator=estimator)
+    by_street = ratios.ratios_of(of(runs, estimator), of(runs, "thesis"), "rmse")
+    return ratio(row, quantity, by_street, metric=METRICS["rmse"], estimator=estimator)
 
 
 def over_raw(quantity: str, runs: pd.DataFrame, metric: str) -> dict[str, Any]:
     """Return row 15's ratio of an error after an alignment to the RMSE of the same runs."""
     refined = of(runs, "refined")
-    ratios = compare.ratios(refined.assign(rmse=refined[metric]), refined, "rmse")
-    return ratio("15", quantity, ratios, metric=METRICS["rmse"], estimator="refined")
+    by_street = ratios.ratios_of(refined.assign(rmse=refined[metric]), refined, "rmse")
+    return ratio("15", quantity, by_street, metric=METRICS["rmse"], estimator="refined")
 
 
 def mean(
@@ -138,7 +138,7 @@ def of_reported() -> list[dict[str, Any]]:
 def _of_changes(metric: str) -> list[dict[str, Any]]:
     """Return rows 1, 4 and 41 for one metric."""
     change = CHANGES[metric]
-    ratios = 1 + change / 100
+    by_sequence = 1 + change / 100
     # the best of as many widths as there are is better by chance nearly always
     by_chance = len(change) * WIDTHS_TRIED / (WIDTHS_TRIED + 1)
     on_average = "sequences improved on average if masks did nothing"
@@ -146,7 +146,7 @@ def _of_changes(metric: str) -> list[dict[str, Any]]:
         "probability of no more improved sequences if masks did nothing, 15 independent widths"
     )
     of_ratios = ratio(
-        "1", "geometric mean of the error ratios", ratios, geometric_mean=True, metric=metric
+        "1", "geometric mean of the error ratios", by_sequence, geometric_mean=True, metric=metric
     )
     larger, improved = (change > 0).sum(), (change < 0).sum()
     return [
@@ -177,8 +177,8 @@ def of_study(runs: pd.DataFrame, shuffled: pd.DataFrame) -> list[dict[str, Any]]
     shuffled: its repetitions of all keypoints, see `section_4_2.null_distribution`.
     """
     run = partial(of_method, runs)
-    every, masks = run("baseline"), run("masked", [compare.tested_width(runs)])
-    best = section_4_2.of_chosen_width(compare.of_method(runs, "masked"))
+    every, masks = run("baseline"), run("masked", [comparisons.tested_width(runs)])
+    best = section_4_2.of_chosen_width(comparisons.of_method(runs, "masked"))
     nine_to_11, other_widths = run("masked", WIDTHS), run("masked", [*range(1, 9), *range(12, 16)])
     static, static_boundaries = run("static"), run("static-boundaries")
     few, corrected, true_maps = run("fewer"), run("corrected"), run("true-labels")
@@ -216,7 +216,7 @@ def _of_best_widths(
     runs: pd.DataFrame, best: pd.DataFrame, shuffled: pd.DataFrame
 ) -> list[dict[str, Any]]:
     """Return rows 2, 31, 35 and 39. best: the runs with masks of each sequence's best width."""
-    masked, every = compare.of_method(runs, "masked"), compare.of_method(runs, "baseline")
+    masked, every = comparisons.of_method(runs, "masked"), comparisons.of_method(runs, "baseline")
     stability = section_4_2.stability(masked, every)
     by_width = masked.groupby(["sequence", "dilation_width"])[["rmse", "mae"]].mean()
     chosen = by_width.groupby("sequence").idxmin()  # by either error
@@ -226,7 +226,7 @@ def _of_best_widths(
     best_of = "masks of the best width over all keypoints"
     by_both = "width chosen by MAE over width chosen by RMSE"
     return [
-        ratio("2", f"{best_of}, same runs", compare.ratios(best, every, "rmse"), metric="RMSE"),
+        ratio("2", f"{best_of}, same runs", ratios.ratios_of(best, every, "rmse"), metric="RMSE"),
         ratio("31", by_both, rmse_of["mae"] / rmse_of["rmse"], metric="RMSE"),
         measurement("31", "sequences with another best width by MAE", other_width, "sequences"),
         measurement("35", "sequences with a best width of 9 to 11", nine, "sequences"),
@@ -309,7 +309,7 @@ def _of_shuffles(runs: pd.DataFrame) -> list[dict[str, Any]]:
     """Return row 14. Without a repetition there is no shuffled run."""
     if runs["repetition"].nunique() < 2:
         return []
-    spread = compare.shuffle_spread(runs[runs["estimator"].isin(ESTIMATORS)])
+    spread = ratios.range_of_shuffles(runs[runs["estimator"].isin(ESTIMATORS)])
     text = "highest over lowest error of all keypoints, shuffled"
     return [
         ratio("14", text, factors, metric="RMSE", estimator=estimator)

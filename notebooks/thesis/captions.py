@@ -10,17 +10,23 @@ and here (for this run's numbers).
 import json
 from pathlib import Path
 
-from keypoint_study.report import html
+from keypoint_study.report.comparison import CAPTIONS as OF_STUDIES
 
 _HERE = Path(__file__).parent
 REPORTED = json.loads((_HERE / "reported.json").read_text(encoding="utf-8"))
 _CAPTIONS = json.loads((_HERE / "captions.json").read_text(encoding="utf-8"))
 # the 36 figures and 5 tables of the thesis in its order, {chapter: artefacts}
 CHAPTERS = _CAPTIONS["chapters"]
-_OF_STUDIES = {(artefact["kind"], artefact["name"]): artefact for artefact in html.ARTEFACTS}
+_OF_STUDIES = {
+    ("figure", "comparison"): OF_STUDIES["figure"],
+    ("table", "comparison"): OF_STUDIES["ratios"],
+    ("table", "widths"): OF_STUDIES["widths"],
+    ("text", "findings"): ("What the runs show", ""),
+}
 # artefacts that are not in the thesis
 ADDED = [
-    _OF_STUDIES.get((artefact["kind"], artefact["name"]), {}) | artefact
+    dict(zip(("title", "caption"), _OF_STUDIES.get((artefact["kind"], artefact["name"]), ())))
+    | artefact
     for artefact in _CAPTIONS["added"]
 ]
 MADE_BY = _CAPTIONS["made_by"]  # {notebook: names of the artefacts that it writes}

@@ -17,7 +17,7 @@ from matplotlib.container import BarContainer
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from keypoint_study import compare
+from keypoint_study import ratios
 from keypoint_study.report import style
 from keypoint_study.report.style import (
     BASELINE,
@@ -40,7 +40,7 @@ METHODS = {
 COLORS = [color for _, color in METHODS.values()]
 LINES = ["-o", "--s", "-.^", ":D"] * 3  # of up to twelve sequences, beside their colours
 BAND = "lowest to highest of the repetitions"
-# cross on a failed run (see `compare.has_failed`), and on a mean over runs of which one failed
+# cross on a failed run (see `ratios.has_failed`), and on a mean over runs of which one failed
 FAILED: dict[str, Any] = {
     "linestyle": "none",
     "marker": "x",
@@ -133,7 +133,7 @@ def figure_paths(
     pairs = list(zip(axes[::2].flat, axes[1::2].flat, strict=True))
     for panel in np.ravel(pairs[len(groups) :]):
         panel.remove()
-    errors = compare.spread(rows, "rmse")
+    errors = ratios.range_over_repetitions(rows, "rmse")
     for (above, below), (name, runs) in zip(pairs, groups.items(), strict=False):
         of_sequence = {run: path for (sequence, run), path in paths.items() if sequence == name}
         factor = _draw_paths(above, below, truths[name], of_sequence, runs)
@@ -207,12 +207,12 @@ def figure_against_width(masked: pd.DataFrame, baseline: pd.DataFrame, metric: s
     figure: Any = plt.figure(figsize=(PAGE_WIDTH, 3.8 + 1.35 * rows), layout="constrained")
     above, below = figure.subfigures(2, 1, height_ratios=[3.2, 1.35 * rows + 0.6])
     axes = above.subplots()
-    errors = compare.spread(masked, metric, by=["sequence", "dilation_width"])
+    errors = ratios.range_over_repetitions(masked, metric, by=["sequence", "dilation_width"])
     lines = errors["mean"].unstack("sequence")
     lines.plot(ax=axes, style=LINES, markersize=3.5, xticks=lines.index)
     style.ratio_axis(axes.yaxis, lines.to_numpy())
     axes.legend(loc="upper left", bbox_to_anchor=(1, 1))
-    failed = compare.has_failed(masked).groupby([masked["sequence"], masked["dilation_width"]])
+    failed = ratios.has_failed(masked).groupby([masked["sequence"], masked["dilation_width"]])
     crosses = errors["mean"][failed.any()]
     for (_, width), error in crosses.items():
         axes.plot(width, error, **FAILED)
@@ -221,7 +221,7 @@ def figure_against_width(masked: pd.DataFrame, baseline: pd.DataFrame, metric: s
         ylabel=label,
         title=f"{metric.upper()} against dilation width, by sequence",
     )
-    of_all = compare.spread(baseline, metric)
+    of_all = ratios.range_over_repetitions(baseline, metric)
     _, panels = frames.small_panels(names, "width (pixels)", below)
     for panel, name in zip(panels, names, strict=True):
         bars, band = errors.loc[name], of_all.loc[name]

@@ -1,20 +1,10 @@
 """Which few hundred keypoints? Errors against the number of keypoints, by how they are chosen.
 
-How it is decided. These rules were fixed before the runs that the tables show, but when a
-prototype's results on the same streets were known:
-
-1. A choice is compared with all keypoints, with the same estimator. The errors are the aligned ATE
-   and the rotational RPE over one frame, as they are for every run, lost or not.
-2. The ratio is formed as in `study.compare`. (It was the geometric mean with Student's t at first;
-   see there why it changed. No answer of rules 4 and 5 changed with it.)
-3. Runs that failed are counted beside it, not mixed in: those with a step that fails or a turn that
-   no car makes (`metrics.step_errors`).
-4. "As good as all keypoints" is said only if the 90 % interval (two one-sided tests at 5 %) lies
-   within MARGINS, for both errors and both estimators, and no more runs failed than with all.
-
-One rule was added when the results were known, because rule 4 also refuses choices that are better:
-
-5. "No worse than all keypoints" asks rule 4's question of the upper end of the interval alone.
+A choice is compared with all keypoints, with the same estimator. The errors are the aligned ATE and
+the rotational RPE over one frame, as they are for every run, lost or not. Sequences on which a
+choice fails are counted beside the ratio, not mixed in. The verdict (`verdicts.FEW_KEYPOINTS`) is
+that of both errors and both estimators together. Its rule was fixed before the runs that the tables
+show, but when a prototype's results on the same streets were known.
 """
 
 from collections.abc import Iterable
@@ -31,9 +21,10 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from keypoint_study import compare, jobs
+from keypoint_study import comparisons, jobs, ratios
 from keypoint_study.jobs import CONTROL_WIDTH
 from keypoint_study.report import style, texts
+from keypoint_study.verdicts import FEW_KEYPOINTS, verdict
 from keypoint_study.worth import FILL
 from thesis.ablations import FunctionMasks, random_keypoints, run_choices
 from thesis_repro import odometry
@@ -43,7 +34,7 @@ from thesis_repro.odometry import THESIS
 from thesis_repro.odometry.keypoints import filled, spread
 from thesis_repro.running import provenance
 
-ESTIMATORS = {name: jobs.ESTIMATORS[name] for name in ("thesis", "refined")}  # of rule 4
+ESTIMATORS = {name: jobs.ESTIMATORS[name] for name in ("thesis", "refined")}  # of the verdict
 NUMBERS = (50, 100, 200, 400, 800)
 REPETITIONS = 4  # three of them with the matched points shuffled
 TIMED_RUNS = 5
@@ -55,7 +46,7 @@ LABELS = {
     "mask": "the strongest on the mask",
     "filled": f"mask, filled to {FILL} a field",
 }
-ERRORS = compare.JUDGING_METRICS
+ERRORS = comparisons.JUDGING_METRICS
 COLUMNS = (
     "sequence",
     "choice",
@@ -67,7 +58,6 @@ COLUMNS = (
     "rotation",
     "failed",
 )
-MARGINS = {"se3": 1.25, "rotation": 1.1}  # a ratio between 1 / margin and margin is "as good"
 NEAR = 0.8, 1.5  # of the panels that show ratios near 1 enlarged
 
 
@@ -122,7 +112,7 @@ def run_few(
         choice=chosen[0],
         number=chosen[2].astype(int),
         keypoints=table["mean_keypoints"],
-        failed=compare.has_failed(table).astype(int),
+        failed=ratios.has_failed(table).astype(int),
     )[list(COLUMNS)]
 
 
@@ -155,63 +145,66 @@ def time_steps(sequence: Sequence, labels: Path, folder: Path, frames: int = 40)
 def ratios_to_all(runs: pd.DataFrame) -> pd.DataFrame:
     """Return one row a choice, number, estimator and error: its ratio to all keypoints.
 
-    runs: of `run_few`. low, high: 95 %. as_good: whether the 90 % interval is within MARGINS, and
-    no more runs failed than with all keypoints (rule 4). no_worse: the same of its upper end
-    (rule 5).
+    runs: of `run_few`. low, high: of the interval. verdict: see `verdict_on`.
     """
     rows = []
-    keys = ["choice", "number", "estimator"]
-    for (choice, number, estimator), chosen in runs.groupby(keys, sort=False):
-        reference = runs[(runs["choice"] == "all") & (runs["estimator"] == estimator)]
-        no_more_failed = chosen["failed"].sum() <= reference["failed"].sum()
-        for error, margin in MARGINS.items():
-            ratios = compare.ratios(chosen, reference, error)
-            numbers = compare.typical_ratio(ratios)
-            row = {
-                "choice": choice,
-                "number": number,
-                "keypoints": chosen["keypoints"].mean(),
-                "estimator": estimator,
-                "error": error,
-                **{name: numbers[name] for name in ("ratio", "low", "high", "n", "above")},
-                "failed": f"{chosen['failed'].sum()} of {len(chosen)}",
-                **{rule: no_more_failed and good for rule, good in within(ratios, margin).items()},
-            }
-            rows.append(row)
+    reference = runs[runs["choice"] == "all"]
+    for (choice, number), chosen in runs.groupby(["choice", "number"], sort=False):
+        word = "" if choice == "all" else verdict_on(chosen, reference)
+        for estimator, of_estimator in chosen.groupby("estimator", sort=False):
+            of_all = reference[reference["estimator"] == estimator]
+            failed = of_estimator["failed"]
+            for error in ERRORS:
+                numbers = ratios.typical_ratio(ratios.ratios_of(of_estimator, of_all, error))
+                row = {
+                    "choice": choice,
+                    "number": number,
+                    "keypoints": of_estimator["keypoints"].mean(),
+                    "estimator": estimator,
+                    "error": error,
+                    **{name: numbers[name] for name in ("ratio", "low", "high", "n", "above")},
+                    "failed": f"{failed.sum()} of {len(failed)}",
+                    "verdict": word,
+                }
+                rows.append(row)
     return pd.DataFrame(rows)
 
 
-def within(ratios: pd.Series, margin: float) -> dict[str, bool]:
-    """Say whether one-sided tests at 5 % place the ratio within the margin (rules 4, 5)."""
-    _, low, high = compare.typical_interval(np.log(ratios), level=90)  # NaN for few sequences
-    is_below = bool(high < np.log(margin))
-    return {"as_good": is_below and bool(low > -np.log(margin)), "no_worse": is_below}
+def verdict_on(chosen: pd.DataFrame, reference: pd.DataFrame) -> str:
+    """Return the verdict on some runs, compared with those of all keypoints.
+
+    Both have the columns sequence, estimator, failed, and those of ERRORS.
+    """
+    narrow, fails_more, counts = [], False, []
+    for estimator in ESTIMATORS:
+        arms = [rows[rows["estimator"] == estimator] for rows in (chosen, reference)]
+        failing = [
+            ratios.failing_sequences(rows.set_index("sequence")["failed"] > 0) for rows in arms
+        ]
+        fails_more |= failing[0] > failing[1]
+        for error in ERRORS:
+            of_streets = ratios.ratios_of(arms[0], arms[1], error)
+            counts.append(len(of_streets))
+            narrow.append((error, *ratios.narrow_interval(of_streets)))
+    return verdict(FEW_KEYPOINTS, min(counts), narrow=narrow, fails_more=fails_more)
 
 
 def table_of_few(rows: pd.DataFrame, times: pd.DataFrame | None = None) -> pd.DataFrame:
-    """Return one row a choice and number, for readers.
-
-    rows: of `ratios_to_all`. times: of `time_steps`.
-    "as good" and "no worse" are "yes" if a rule holds for both errors and both estimators.
-    """
+    """Return one row a choice and number. rows: of `ratios_to_all`; times: `time_steps`."""
     keys = ["choice", "number"]
     milliseconds = {} if times is None else times.set_index(keys)["milliseconds"]
     lines = []
     for (choice, number), chosen in rows.groupby(keys, sort=False):
         mean = chosen["keypoints"].iloc[0]
         line: dict[str, Any] = {"keypoints": f"{mean:.0f}", "how chosen": LABELS[choice]}
-        for row in chosen.itertuples():
-            ratio, low, high = map(texts.number, (row.ratio, row.low, row.high))
-            name = f"{ERRORS[row.error]}, {ESTIMATORS[row.estimator]}"
-            line[name] = f"{ratio} ({low}-{high}), {row.above} of {row.n}"
+        for row in chosen.to_dict("records"):
+            name = f"{ERRORS[row['error']]}, {ESTIMATORS[row['estimator']]}"
+            line[name] = f"{texts.short(row)}, {row['above']} of {row['n']}"
         for row in chosen.drop_duplicates("estimator").itertuples():
             line[f"failed, {ESTIMATORS[row.estimator]}"] = row.failed
         if times is not None:
             line["CPU time a frame (ms)"] = milliseconds.get((choice, number))
-        for rule in ("as_good", "no_worse"):
-            is_so = choice != "all" and chosen[rule].all()
-            line[rule.replace("_", " ")] = "yes" if is_so else ""
-        lines.append(line)
+        lines.append(line | {"verdict": chosen["verdict"].iloc[0]})
     return pd.DataFrame(lines)
 
 
@@ -226,7 +219,7 @@ def figure_of_few(rows: pd.DataFrame) -> Figure:
         for panel, estimator in zip(panel_row, ESTIMATORS, strict=True):
             shown = rows[(rows["error"] == error) & (rows["estimator"] == estimator)]
             _draw_curves(panel, shown, near)
-            title = f"{compare.METRICS[error]}, {ESTIMATORS[estimator]}"
+            title = f"{comparisons.METRICS[error]}, {ESTIMATORS[estimator]}"
             panel.set_title(f"the same, {NEAR[0]} to {NEAR[1]}" if near else title)
             if not near:
                 style.ratio_axis(panel.yaxis, rows[["ratio", "low", "high"]].to_numpy())

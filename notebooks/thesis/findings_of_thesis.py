@@ -31,9 +31,9 @@ def write(
     compared: pd.DataFrame,
     note: str,
 ) -> str:
-    """Write the findings of a run (see `findings.text`) beside the figures, and return them.
+    """Write the findings of a run (`findings.findings_of`) beside the figures, and return them.
 
-    compared: `compare.comparisons` of the runs.
+    compared: `comparisons_of` the runs.
     """
     quality = domain_gap.label_map_quality(settings.build).round(3)
     quality = quality.filter(["domain", "images", "classes", "mean_iou", "seen"])
@@ -45,6 +45,6 @@ def write(
         count=trainings.read()["training"].nunique(),
         thesis_width=CONTROL_WIDTH,
     )
-    text = findings.text(runs, compared, note, settings.kitti_is_embedded, more)
+    text = findings.findings_of(runs, compared, note, settings.kitti_is_embedded, more)
     write_text(settings.figures / "findings.md", text)
     return text

@@ -139,9 +139,9 @@ def build(settings: Settings) -> str:
     of_thesis = [artefact for artefact in artefacts if artefact["number"] is not None]
     docs = _links_to_documents(settings)
     answer = _answer(docs) if docs and settings.figures_in_git else None
-    executed, made = [], html.made_with()
+    executed, made = [], html.versions()
     if not settings.figures_in_git:  # a clone has no executed notebooks
-        executed, made = _executed(settings), made | html.made_on()
+        executed, made = _executed(settings), made | html.machine()
     if executed:
         latest = max(path.stat().st_mtime for path in executed)
         made["day"] = f"{datetime.fromtimestamp(latest, UTC):%d %B %Y}"

@@ -1,15 +1,16 @@
 """What the thesis's own comparison gives (Section 4.2, Tables 4.1 to 4.3).
 
-The choice of a width is in `study.best_width`; all other comparisons are in `study.compare`. A
-change is Equation 4.1 of means over the repetitions, in percent; negative is better. `masked` and
-`baseline` are the runs with masks of each width and with all keypoints, from `compare.of_method`.
+The choice of a width is in `keypoint_study.best_width`; all other comparisons are in
+`keypoint_study.comparisons`. A change is Equation 4.1 of means over the repetitions, in percent;
+negative is better. `masked` and `baseline` are the runs with masks of each width and with all
+keypoints, from `comparisons.of_method`.
 `shuffled` are runs with all keypoints, many repetitions. A metric is "rmse" or "mae".
 """
 
 import numpy as np
 import pandas as pd
 
-from keypoint_study import compare
+from keypoint_study import ratios, verdicts
 from keypoint_study.best_width import (
     best_widths,
     changes,
@@ -106,7 +107,7 @@ def null_distribution(baseline: pd.DataFrame, widths: int, metric: str) -> pd.Da
 
 def middle(values: pd.Series) -> tuple[float, float]:
     """Return the ends of the middle 95 percent of a number of simulated studies."""
-    tail = (100 - compare.LEVEL) / 200
+    tail = (100 - verdicts.LEVEL) / 200
     return values.quantile(tail), values.quantile(1 - tail)
 
 
@@ -169,18 +170,18 @@ def table_of_change(
 
 def _failed_of(runs: pd.DataFrame) -> pd.Series:
     """Return the failed runs of each sequence as a text, "2 of 5"."""
-    failed = {name: compare.count_failed(rows) for name, rows in runs.groupby("sequence")}
+    failed = {name: ratios.count_failed(rows) for name, rows in runs.groupby("sequence")}
     return pd.Series(failed, dtype=str)
 
 
 def _summary(changes: pd.Series) -> dict[str, float]:
     """Return the last rows of Tables 4.2 and 4.3 for one column of changes (%)."""
-    low, high = compare.mean_interval(changes)
+    low, high = ratios.mean_interval(changes)
     return {
         "sum (the thesis's aggregate)": changes.sum(min_count=1),
         "mean": changes.mean(),
-        f"mean, {compare.LEVEL} % CI over sequences, from": low,
-        f"mean, {compare.LEVEL} % CI over sequences, to": high,
+        f"mean, {verdicts.LEVEL} % CI over sequences, from": low,
+        f"mean, {verdicts.LEVEL} % CI over sequences, to": high,
         "median": changes.median(),
         "sequences improved": float((changes < 0).sum()),
     }
@@ -190,7 +191,7 @@ def _summary_of_studies(studies: pd.DataFrame) -> dict[str, float]:
     """Return the last rows for simulated studies (%), one row a study: means over the studies."""
     means = studies.mean(axis=1)
     low, high = middle(means)
-    of_studies = f"mean, middle {compare.LEVEL} % of {len(studies)} simulated studies"
+    of_studies = f"mean, middle {verdicts.LEVEL} % of {len(studies)} simulated studies"
     return {
         "sum (the thesis's aggregate)": studies.sum(axis=1).mean(),
         "mean": means.mean(),

@@ -5,7 +5,7 @@
 
 import pandas as pd
 
-from keypoint_study import compare, jobs
+from keypoint_study import comparisons, jobs
 from thesis.settings import ROOT, Settings
 from thesis_repro.running import provenance
 from thesis_repro.running.files import listed
@@ -14,8 +14,8 @@ TABLE = ROOT / "figures" / "trainings.csv"
 NUMBERS = {  # columns of the table: their names in `table_of_trainings`
     "keypoints": "keypoints with masks",
     "mean_iou": "mean IoU of the label maps",
-    "se3_ratio": f"ratio of the {compare.METRICS['se3']}",
-    "rotation_ratio": f"ratio of the {compare.METRICS['rotation']}",
+    "se3_ratio": f"ratio of the {comparisons.METRICS['se3']}",
+    "rotation_ratio": f"ratio of the {comparisons.METRICS['rotation']}",
     "rmse_ratio": "ratio of the RMSE",
     "table_4_2_mean": "mean of Table 4.2 (%), best of 15 widths",
     "table_4_2_improved": "sequences improved in Table 4.2",

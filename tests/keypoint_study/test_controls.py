@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from keypoint_study import compare, controls, methods, runner
+from keypoint_study import comparisons, controls, methods, runner
 from keypoint_study.jobs import first_jobs, runs_of
 from keypoint_study.sources import Source
 from thesis import ablations, section_4_2
@@ -104,13 +104,13 @@ def test_controls_leave_as_many_keypoints_as_masks_of_the_tested_width(
     jobs = first_jobs(opened, {"thesis": (5, WIDTH), "refined": ()}, tested=5)
     assert {job.dilation_width for job in jobs if job.method in methods.MASK_CONTROLS} == {5}
     runs = runner.run_all(runs_of(jobs, opened, small_labels), tmp_path).table
-    left = compare.keypoints_left(runs)
-    masked = compare.of_method(runs, "masked")
+    left = comparisons.keypoints_left(runs)
+    masked = comparisons.of_method(runs, "masked")
     jobs += section_4_2.reduced_jobs(section_4_2.best_widths(masked))
     jobs += runner.keypoint_controls(runs, opened, [Source(small_labels)], 1, 5)
     assert len({job.name for job in jobs}) == len(jobs)
     runs = runner.run_all(runs_of(jobs, opened, small_labels), tmp_path).table.set_index("run")
-    assert list(runs.index) == [job.name for job in jobs] and compare.tested_width(runs) == 5
+    assert list(runs.index) == [job.name for job in jobs] and comparisons.tested_width(runs) == 5
     number = runs["mean_keypoints"]
     assert left["00"] == number["masked-05-0"] < number["masked-10-0"]
     fewer = number[number.index.str.startswith("fewer")]

@@ -106,18 +106,27 @@ def test_evo_reads_the_written_paths(done, study):
 def test_figures_and_tables_of_a_study(done, study):
     folder, runs = done
     page = report.write(study, runs, folder)
-    for name in ("comparison", "sources", "paths-00", "paths-01"):
-        assert (folder / f"{name}.pdf").read_bytes().startswith(b"%PDF")
-        assert {f"{name}.svg", f"{name}.webp"} & {path.name for path in folder.iterdir()}
-    for name in ("summary", "comparison", "widths", "errors"):
-        assert (folder / f"{name}.md").is_file()
-    assert not (folder / "runs.tex").exists()
+    names = {path.name for path in folder.iterdir()}
+    # the controls of each source have a figure of their own
+    figures = ("comparison", "comparison-net", "comparison-by-hand", "sources", "paths-00")
+    for name in figures:
+        assert {f"{name}.svg", f"{name}.webp"} & names
+        for end in (".pdf", "-column.pdf"):
+            content = (folder / f"{name}{end}").read_bytes()
+            assert b"/Type3" not in content and b"/FontFile2" in content  # TrueType
+            width = float(re.search(rb"/MediaBox \[ 0 0 ([\d.]+)", content)[1])
+            assert (width == 3.5 * 72) == (end == "-column.pdf")
+    tables = {"errors.csv", "errors.md", "errors.tex", "widths.tex", "ratios.csv", "ratios.tex"}
+    assert {*tables, "runs.csv"} <= names and not {"ratios.md", "runs.tex"} & names
+    ratios = pd.read_csv(folder / "ratios.csv")
+    keys = ["source", "label", "reference_source", "reference", "metric", "estimator"]
+    assert not ratios.duplicated(keys).any()
     links = re.findall('(?:href|src)="([^"#]+)"', page.read_text())
-    assert {"sources.webp", "paths-01.pdf", "errors.tex"} <= set(links)
+    assert {"sources.webp", "paths-01.pdf", "errors.tex", "runs.csv"} <= set(links)
     assert all((folder / link).is_file() for link in links)
-    assert len(report.figure_sources(study, runs).axes) == 3 * len(study.sources)
+    assert len(report.figure_of_sources(study, runs).content.axes) == 3 * len(study.sources)
     failed = (runs["sequence"] == "01") & (runs["source"] == "net")
-    figure = report.figure_paths(study, runs[~failed], study.opened[1], folder)
+    figure = report.figure_of_sequence(study, runs[~failed], study.opened[1], folder).content
     assert len(figure.axes[0].lines) == 3  # all keypoints, by hand, ground truth
 
 
@@ -205,8 +214,9 @@ def test_own_keypoints_and_paths_are_rows_as_masks_are(brought, tmp_path):
     expected = of_all.loc[slam.index, numbers[:3]]
     assert np.allclose(slam[numbers[:3]], expected, atol=1e-8) and len(slam) == 2
     report.write(brought, runs, tmp_path / "out")
-    summary = pd.read_csv(tmp_path / "out" / "summary.csv")
-    assert list(summary["source"]) == ["mine", "slam"] and summary["keypoints"].count() == 1
+    ratios = pd.read_csv(tmp_path / "out" / "ratios.csv").query("method != 'baseline'")
+    assert list(ratios["label"].unique()) == ["mine", "slam"]
+    assert ratios.groupby("label")["keypoints"].count()["slam"] == 0
     errors = pd.read_csv(tmp_path / "out" / "errors.csv")
     assert list(errors["method"]) == ["all keypoints", "mine", "slam"] * 2
     times = files(tmp_path / "out")

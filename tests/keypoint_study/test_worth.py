@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 from street import Street
 
-from keypoint_study import compare, worth
+from keypoint_study import verdicts, worth
 from thesis_repro.errors import InputError
 from thesis_repro.odometry import OPENCV, THESIS
 
@@ -117,31 +117,33 @@ def test_verdicts_need_both_splits_and_both_motions():
     near_one = random.normal(0, 0.03, (8, 4))
 
     def verdict(logarithms):
-        (row,) = worth.typical(worths(logarithms)).itertuples()
+        (row,) = worth.typical_worths(worths(logarithms)).itertuples()
         return row.verdict
 
-    assert verdict(near_one) == worth.ALIKE
-    assert verdict(near_one - 0.7) == worth.LESS
-    assert verdict(near_one + 0.7) == worth.MORE
+    assert verdict(near_one) == verdicts.AS_MUCH
+    assert verdict(near_one - 0.7) == verdicts.LESS
+    assert verdict(near_one + 0.7) == verdicts.MORE
     for column in range(4):
         less_but_one = near_one - 0.7 * (np.arange(4) != column)
-        assert verdict(less_but_one) == compare.NO_CLEAR_DIFFERENCE
-    assert verdict(near_one[:5] - 0.7) == compare.TOO_FEW
+        assert verdict(less_but_one) == verdicts.NO_CLEAR_DIFFERENCE
+    assert verdict(near_one[:5] - 0.7) == verdicts.TOO_FEW
 
 
 def test_error_rates_of_the_verdicts_by_chance():
     """Eight streets that differ by 30 %; worths of one street are correlated by 0.5."""
     random = np.random.default_rng(0)
 
-    def verdicts(centre):
+    def words(centre):
         spread = random.normal(0, 0.3 * np.sqrt(0.5), (200, 8, 1))
         spread = spread + random.normal(0, 0.3 * np.sqrt(0.5), (200, 8, 4))
-        return [worth._verdict(list((each + centre).T)) for each in spread]
+        names = [f"{motion}_{split}" for split in worth.SPLIT for motion in worth.MOTIONS]
+        streets = [pd.DataFrame(each + centre, columns=names) for each in spread]
+        return [worth._verdict(dict(of_study.items())) for of_study in streets]
 
-    wrong = [each in (worth.LESS, worth.MORE) for each in verdicts(0)]
+    wrong = [each in (verdicts.LESS, verdicts.MORE) for each in words(0)]
     assert np.mean(wrong) < 0.03
-    assert np.mean([each == worth.LESS for each in verdicts(np.log(0.5))]) > 0.9
-    assert np.mean([each == worth.ALIKE for each in verdicts(np.log(worth.AS_MUCH))]) < 0.05
+    assert np.mean([each == verdicts.LESS for each in words(np.log(0.5))]) > 0.9
+    assert np.mean([each == verdicts.AS_MUCH for each in words(np.log(1.25))]) < 0.05
 
 
 def test_the_table_is_the_same_every_time_and_an_empty_mask_tells_nothing(monkeypatch):
@@ -151,10 +153,10 @@ def test_the_table_is_the_same_every_time_and_an_empty_mask_tells_nothing(monkey
         ("few", 0): (replace(THESIS, max_keypoints=60), None),
         ("none", 100): (THESIS, [np.zeros(street.size, np.uint8)] * len(street)),
     }
-    table = worth.worth(street, choices)
-    pd.testing.assert_frame_equal(table, worth.worth(street, choices))
+    table = worth.worth_of(street, choices)
+    pd.testing.assert_frame_equal(table, worth.worth_of(street, choices))
     monkeypatch.setattr(worth, "SEED", 1)
-    assert not table.equals(worth.worth(street, choices))
+    assert not table.equals(worth.worth_of(street, choices))
     table = table.set_index(["choice", "split"])
     assert (table["steps"] == 4).all()
     assert (table.loc["random", "keypoints"] == 100).all()
@@ -167,7 +169,7 @@ def test_own_keypoints_are_found_and_tracked_by_their_own_functions():
     street = Street(3)
     calls = {"still": OPENCV._replace(track=lambda _, __, points, ___: (points, points[:, 0] > 0))}
     choices = {("still", 100): (THESIS, None), ("tracked", 100): (THESIS, None)}
-    table = worth.worth(street, choices, calls=calls).set_index(["choice", "split"])
+    table = worth.worth_of(street, choices, calls=calls).set_index(["choice", "split"])
     assert (table.loc["still", "rotation_deg"] != table.loc["tracked", "rotation_deg"]).all()
 
 
@@ -176,18 +178,18 @@ def test_what_the_camera_did_not_see_has_no_keypoints(monkeypatch):
     visible = np.zeros_like(street.frame(0))
     visible[:, : visible.shape[1] // 2] = 255
     choices = {("all", 0): (THESIS, None)}
-    whole = worth.worth(street, choices)
+    whole = worth.worth_of(street, choices)
     monkeypatch.setattr(street, "visible", lambda index: visible)
-    half = worth.worth(street, choices)
+    half = worth.worth_of(street, choices)
     assert 0 < half["keypoints"].max() < 0.8 * whole["keypoints"].min()
 
 
 def test_steps_without_lengths_are_all_kept_and_short_ones_are_not():
     street = Street(4)
     street.poses[2:, :3, 3] = street.poses[1, :3, 3]  # the last two steps are short
-    assert (worth.worth(street, {("all", 0): (THESIS, None)})["steps"] == 1).all()
+    assert (worth.worth_of(street, {("all", 0): (THESIS, None)})["steps"] == 1).all()
     street.has_truth, street.speed = False, None
-    assert (worth.worth(street, {("all", 0): (THESIS, None)})["steps"] == 3).all()
+    assert (worth.worth_of(street, {("all", 0): (THESIS, None)})["steps"] == 3).all()
     street.folder, street.speed, street.times = "street", 0.0, np.arange(4)
     with pytest.raises(InputError):
-        worth.worth(street, {("all", 0): (THESIS, None)})
+        worth.worth_of(street, {("all", 0): (THESIS, None)})

@@ -7,9 +7,8 @@ import pytest
 
 import evidence
 import write_texts
-from keypoint_study import compare
-from keypoint_study.report import style
-from keypoint_study.report import worth as report_worth
+from keypoint_study import comparisons
+from keypoint_study.report import comparison, style, worths
 from thesis import few_keypoints, section_4_2
 
 NUMBER = re.compile(r"-?\d+(?:\.\d+)?")
@@ -21,19 +20,28 @@ def runs(name):
 
 
 def of_the_thesis(metric=None):
-    masked, baseline = (compare.of_method(runs("runs"), name) for name in ("masked", "baseline"))
+    masked, baseline = (
+        comparisons.of_method(runs("runs"), name) for name in ("masked", "baseline")
+    )
     if metric is None:
         return section_4_2.table_4_1(masked, COMPLETE)
     shuffled = runs("shuffled_runs")
     return section_4_2.table_of_change(masked, baseline, shuffled, metric, COMPLETE)
 
 
+def all_pairs():
+    rows = comparison.all_of(comparisons.comparisons_of(runs("runs")))
+    return comparison.table_of_ratios(rows).content
+
+
 TABLES = {
+    "comparison": all_pairs,
+    "widths": lambda: comparison.table_of_widths(runs("runs")).content,
     "table_4_1": of_the_thesis,
     "table_4_2": lambda: of_the_thesis("rmse"),
     "table_4_3": lambda: of_the_thesis("mae"),
     "refined_widths": lambda: evidence.table_of_widths(runs("refined_widths_runs")),
-    "worth": lambda: report_worth.table(runs("worth_runs")),
+    "worth": lambda: worths.table_of_worths(runs("worth_runs")).content,
     "few_keypoints": lambda: few_keypoints.table_of_few(
         few_keypoints.ratios_to_all(runs("few_keypoints_runs"))
     ),

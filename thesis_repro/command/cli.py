@@ -129,7 +129,7 @@ def odometry(options: Any) -> None:
             truth = sequence.poses
             poses = metrics.shifted(poses, truth)
         with style.applied():
-            drawing = paths.figure({"estimate": poses}, truth, f"sequence {sequence.name}")
+            drawing = paths.figure_of_paths({"estimate": poses}, truth, f"sequence {sequence.name}")
             style.write_figure(drawing, options.plot)
     print(json.dumps(record) if options.json else _text(record, sequence, options.speed))
     for name, path in _output_files(options).items():

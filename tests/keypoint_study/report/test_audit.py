@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from keypoint_study import compare
+from keypoint_study import comparisons
 from keypoint_study.report import style
 from thesis import (
     ablations,
@@ -168,7 +168,7 @@ def test_the_audit_and_the_comparison_answer_a_question_with_the_same_number():
         {"baseline": [None], "masked": [5, 10], "fewer": [10], "corrected": [10]},
         noise=0.3,
     )
-    table = compare.comparisons(runs)
+    table = comparisons.comparisons_of(runs)
     compared = table[table["tested"] & (table["reference"] == "baseline")].set_index(
         ["method", "estimator", "metric"]
     )

@@ -87,10 +87,12 @@ DRAWN = {
     "4.8 without keypoints": lambda: chapter4.figure_4_08(
         flicker.follow_window([FRAME] * 2, [BLANK] * 2, 5), "00"
     ),
-    "paths": lambda: paths.figure(
+    "paths": lambda: paths.figure_of_paths(
         {"masked": turning(), "$all$": 2 * turning()}, turning(), "sequence 00"
     ),
-    "paths without truth": lambda: paths.figure({"masked": turning()}, None, "sequence 11"),
+    "paths without truth": lambda: paths.figure_of_paths(
+        {"masked": turning()}, None, "sequence 11"
+    ),
 }
 
 

@@ -1,9 +1,11 @@
 """Figures and tables of chapter 4, the comparison and the findings show the numbers of the runs."""
 
+import re
 from html import escape
 from types import SimpleNamespace
 
 import made_up
+import matplotlib
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
@@ -11,24 +13,26 @@ import pytest
 from cells import cells
 from drawn import problems
 from matplotlib.container import BarContainer
+from matplotlib.font_manager import FontProperties
+from matplotlib.textpath import TextPath
 
-from keypoint_study import compare
+from keypoint_study import comparisons, ratios, verdicts
 from keypoint_study.jobs import ESTIMATORS
-from keypoint_study.report import comparison, findings, html, study_report, style, texts
+from keypoint_study.report import comparison, findings, html, latex, style, texts
 from thesis import chapter4, few_keypoints, frames, section_4_2
 from thesis.captions import REPORTED
 from thesis_repro.errors import one_line
 
 AHEAD = np.array([[0, 0, z] for z in range(4)])  # true positions, metres
 ELEVEN = [f"{number:02d}" for number in range(11)]
-CONTROLS = compare.SEGMENTATION_FREE_CONTROLS
+CONTROLS = comparisons.SEGMENTATION_FREE_CONTROLS
 NEVER_SHUFFLED = made_up.runs(
     ["00"], lambda *_: 1.0, {"baseline": [None]}, estimators=["thesis"], repetitions=1
 )
 
 
 def best_of(runs):
-    return section_4_2.of_chosen_width(compare.of_method(runs, "masked"))
+    return section_4_2.of_chosen_width(comparisons.of_method(runs, "masked"))
 
 
 def runs_of(names, errors, widths=(5, 10, 15), **options):
@@ -40,7 +44,7 @@ def runs_of(names, errors, widths=(5, 10, 15), **options):
 
 def widths_of(runs):
     """The runs with masks and with all keypoints, as notebook 8 selects them."""
-    return compare.of_method(runs, "masked"), compare.of_method(runs, "baseline")
+    return comparisons.of_method(runs, "masked"), comparisons.of_method(runs, "baseline")
 
 
 def halved(name, method, _):
@@ -125,23 +129,28 @@ def test_failed_runs_are_counted():
         .loc["03", "failed runs"]
         == "1 of 3"
     )
-    compared = comparison.table_comparison(compare.comparisons(runs))
+    compared = comparison.table_of_ratios(comparisons.comparisons_of(runs)).content
     of_masks = compared[(compared["keypoints"] == "masks, width 10")].iloc[0]
     assert (
         of_masks["failed runs"] == "1 of 33"
         and of_masks["failed runs of the reference"] == "0 of 33"
     )
     assert (
-        comparison.table_widths(runs).set_index("sequence").loc["failed runs"].iloc[4] == "1 of 33"
+        comparison.table_of_widths(runs).content.set_index("sequence").loc["failed runs"].iloc[4]
+        == "1 of 33"
     )
 
 
 def test_errors_are_means_with_their_spread_and_the_lowest_is_bold():
     runs = runs_of(ELEVEN, halved, noise=0.2)
-    table = comparison.table_errors(compare.comparisons(runs), runs)
-    methods = ["all keypoints", "masks, width 10", *(compare.METHODS[name] for name in CONTROLS)]
+    table = comparison.table_of_errors(comparisons.comparisons_of(runs), runs).content
+    methods = [
+        "all keypoints",
+        "masks, width 10",
+        *(comparisons.METHODS[name] for name in CONTROLS),
+    ]
     assert list(table["method"]) == 4 * methods and list(table.columns[3:]) == ELEVEN
-    assert list(table["estimator"].unique()) == ["vote of all points", "refined estimator"]
+    assert list(table["estimator"].unique()) == ["thesis's estimator", "refined estimator"]
     assert list(table["error"].unique()) == ["aligned ATE (m)", "rotational RPE, 1 frame (deg)"]
     masked = (runs["method"] == "masked") & (runs["dilation_width"] == 10)
     errors = runs[masked & (runs["estimator"] == "refined") & (runs["sequence"] == "03")]["se3"]
@@ -151,59 +160,79 @@ def test_errors_are_means_with_their_spread_and_the_lowest_is_bold():
     bold = table[ELEVEN].map(lambda cell: cell.startswith("**"))
     of_masks = bold[table["method"] == "masks, width 10"]
     assert (bold.sum() == 4).all() and of_masks.to_numpy().mean() > 0.9
-    pieces = study_report.latex_errors(table).split("\\end{tabular}")[:-1]
-    assert len(pieces) == 12 and all("{lllll}" in piece or "{llll}" in piece for piece in pieces)
-    assert sum(piece.count("\\textbf{") for piece in pieces) == 44
     paths = runs[runs["method"] == "baseline"].assign(method="paths", source="slam")
     beside = pd.concat([runs_of(ELEVEN, halved, noise=0.2, sources=("net",)), paths])
-    shown = comparison.table_errors(compare.comparisons(beside), beside)
+    shown = comparison.table_of_errors(comparisons.comparisons_of(beside), beside).content
     assert len(shown) == len(table) + 4 and "slam" in set(shown["method"])
     once = runs[runs["repetition"] == 0]
-    single = comparison.table_errors(compare.comparisons(once), once)
+    single = comparison.table_of_errors(comparisons.comparisons_of(once), once).content
     assert not single[ELEVEN].map(lambda cell: "±" in cell).any(axis=None)
 
 
-def test_deviations_of_zero_are_a_note_below_the_table():
+def test_deviations_of_zero_are_left_out():
     runs = runs_of(ELEVEN[:5], halved)
     refined = runs["estimator"] == "refined"
     runs.loc[~refined, "se3"] *= 1 + 0.1 * runs["repetition"]
-    table = comparison.table_errors(compare.comparisons(runs), runs)
+    table = comparison.table_of_errors(comparisons.comparisons_of(runs), runs).content
     has_deviation = table[ELEVEN[:5]].map(lambda cell: "±" in cell).all(axis=1)
-    varied = (table["error"] == "aligned ATE (m)") & (table["estimator"] == "vote of all points")
+    varied = (table["error"] == "aligned ATE (m)") & (table["estimator"] == "thesis's estimator")
     assert has_deviation.equals(varied) and varied.any()
-    text = study_report.latex_errors(table, 3)
-    assert "0.0000" not in text and text.count(study_report.NO_DEVIATION) == 6  # of 8 tables
-    assert study_report.NO_DEVIATION not in study_report.latex_errors(table)
 
 
-def test_failures_of_the_other_estimator_stand_in_the_summary():
-    runs = runs_of(ELEVEN, halved)
-    failing = (runs["method"] == "masked") & (runs["estimator"] == "thesis")
-    runs.loc[failing & (runs["dilation_width"] == 10), "failed"] = 5.0
-    (row,) = comparison.table_summary(compare.comparisons(runs)).to_dict("records")
-    assert row["estimator"] == "refined estimator"
-    assert row["failed runs"] == "0 of 33; thesis's estimator 33 of 33"
-    assert row["failed runs of the reference"] == "0 of 33; thesis's estimator 0 of 33"
+def widths_in(text):
+    """The width of each table in LaTeX, in points, measured in Computer Modern of 8 points."""
+    font = FontProperties(fname=f"{matplotlib.get_data_path()}/fonts/ttf/cmr10.ttf")
+    widths = []
+    for table in re.findall(r"\\toprule\n(.*?)\\bottomrule", text, re.S):
+        plain = re.sub(r"\\(shortstack\[l\]|textbf|midrule\n|\\$)", "", table)
+        plain = re.sub(r"\$.*?\$", "+", plain)
+        rows = [row.split("&") for row in plain.strip().split(" \\\\\n")]
+        width = 85
+        for column in list(zip(*rows, strict=True))[1:]:
+            lines = [line.strip(" {}\\") for cell in column for line in cell.split(" \\\\ ")]
+            paths = [TextPath((0, 0), line, 8, prop=font) for line in lines if line]
+            width += 6 + max(path.get_extents().width for path in paths)
+        widths.append(width)
+    return widths
+
+
+@pytest.mark.parametrize("count", [1, 4, 11])
+def test_tables_for_a_paper_fit_a_column_and_have_caption_and_label(count):
+    runs = runs_of(ELEVEN[:count], halved, noise=0.2, sources=("a_100%{net}", "hand"))
+    runs["se3"] *= 1000
+    table = comparisons.comparisons_of(runs)
+    errors = comparison.table_of_errors(table, runs)
+    widths = comparison.table_of_widths(runs)
+    for artefact, rows in (
+        (errors, errors.content),
+        (widths, widths.content),
+        (comparison.long_table_of_ratios(table), comparison.ratios_for_paper(table)),
+    ):
+        text = latex.latex_of(artefact, rows)
+        measured = widths_in(text)
+        assert measured and max(measured) <= 3.5 * 72
+        for command in ("caption", "label", "end{tabular}", "fontsize{8}"):
+            assert text.count(f"\\{command}") == len(measured)
+        assert "a_100" not in text
+        assert len(set(re.findall(r"\\label{.*?}", text))) == len(measured)
 
 
 def test_ratios_in_the_tables_equal_the_comparison():
     runs = runs_of(ELEVEN, halved, noise=0.2)
-    table = compare.comparisons(runs)
-    shown = comparison.table_comparison(table)
+    table = comparisons.comparisons_of(runs)
+    shown = comparison.table_of_ratios(comparison.all_of(table)).content
     assert len(shown) == 2 * (1 + 2 * len(CONTROLS))
     of_rmse = table[table["tested"] & (table["method"] != "baseline") & (table["metric"] == "rmse")]
     for row in of_rmse[of_rmse["reference"] == "baseline"].itertuples():
         cell = shown[
             (shown["estimator"] == ESTIMATORS[row.estimator])
             & (shown["over"] == "all keypoints")
-            & shown["keypoints"].str.startswith(compare.METHODS[row.method])
+            & shown["keypoints"].str.startswith(comparisons.METHODS[row.method])
         ]["RMSE"].iloc[0]
-        ratio, low, high = map(
-            float, cell.replace("(", "").replace(")", "").replace("-", " ").split()
-        )
+        ratio, low, high = map(float, re.findall(r"[\d.]+", cell))
         assert (ratio, low, high) == pytest.approx((row.ratio, row.low, row.high), abs=0.0051)
-    widths = comparison.table_widths(runs).set_index("sequence")
-    expected = compare.ratios(best_of(runs), compare.of_method(runs, "baseline"), "rmse")
+    widths = comparison.table_of_widths(runs).content.set_index("sequence")
+    expected = ratios.ratios_of(best_of(runs), comparisons.of_method(runs, "baseline"), "rmse")
     assert widths.loc[ELEVEN, "best width: RMSE"].astype(float).to_numpy() == pytest.approx(
         expected, abs=0.0051
     )
@@ -217,59 +246,62 @@ def test_ratios_in_the_tables_equal_the_comparison():
 
 
 @pytest.mark.parametrize(
-    "value, text",
+    "low, high, text",
     [
-        (1.09, "1.09"),
-        (1.0018, "1.0018"),
-        (0.9951, "0.9951"),
-        (1.0, "1.00"),
-        (0.0041, "0.0041"),
-        (-0.004, "-0.0040"),
-        (0.0, "0.00"),
-        (float("nan"), "nan"),
+        (0.98, 1.3, "1.09 (0.98-1.30)"),
+        (1.00001, 1.3, "1.09 (1.00-1.30) ↑"),
+        (0.2, 0.99999, "1.09 (0.20-1.00) ↓"),
+        (float("nan"), float("nan"), "1.09"),
     ],
 )
-def test_a_ratio_near_zero_or_one_has_more_digits(value, text):
-    assert texts.number(value) == text
+def test_a_ratio_has_two_digits_and_a_mark_if_its_interval_excludes_1(low, high, text):
+    assert texts.short({"ratio": 1.0888, "low": low, "high": high}) == text
 
 
 @pytest.mark.parametrize(
     "errors, names, verdict",
     [
-        (halved, ELEVEN, compare.LOWER),
-        (lambda *of: 1 / halved(*of), ELEVEN, compare.HIGHER),
-        (lambda *_: 1.0, ELEVEN[:6], compare.NO_CLEAR_DIFFERENCE),
-        (halved, ["00", "05"], compare.TOO_FEW),
+        (halved, ELEVEN, verdicts.LOWER),
+        (lambda *of: 1 / halved(*of), ELEVEN, verdicts.HIGHER),
+        (lambda *_: 1.0, ELEVEN[:6], verdicts.NO_CLEAR_DIFFERENCE),
+        (halved, ["00", "05"], verdicts.TOO_FEW),
     ],
 )
 @pytest.mark.parametrize("sources", [("",), ("net", "hand")])
 def test_findings_follow_the_verdict(errors, names, verdict, sources):
     runs = runs_of(names, errors, noise=0.02, sources=sources)
-    table = compare.comparisons(runs)
+    table = comparisons.comparisons_of(runs)
     is_primary = (
         table["decides"] & (table["method"] == "masked") & (table["reference"] == "baseline")
     )
     primary = table[is_primary]
     for source in sources:
-        assert compare.overall(primary.loc[primary["source"] == source, "verdict"]) == verdict
-    text = findings.text(runs, table, "KITTI folder embedded, made up", False)
+        assert comparisons.verdict_of(primary[primary["source"] == source]) == verdict
+    text = findings.findings_of(runs, table, "KITTI folder embedded, made up", False)
     assert text.count(f"{findings.OUTCOMES[verdict]} here.**") == len(sources)
-    summary = comparison.table_summary(table).set_index("source")
-    for source in sources:
-        for row in primary[primary["source"] == source].to_dict("records"):
-            assert f"| {texts.ratio(row)} |" in text
-            cell = summary.loc[source, compare.METRICS[row["metric"]]]
-            assert texts.ratio(row).replace("95 % CI ", "") == cell
-        assert summary.loc[source, "verdict"] == verdict
+    for row in primary.to_dict("records"):
+        assert f"| {texts.short(row)} |" in text
+    too_few = verdict == verdicts.TOO_FEW
+    assert text.count("too few to compare it with the controls") == too_few * len(sources)
+    beaten = {verdicts.LOWER: 6}.get(verdict, 0)
+    assert text.count(f"lower than with {beaten} of 6 controls") == (not too_few) * len(sources)
+
+
+def test_what_is_far_off_is_told_without_it():
+    runs = runs_of(ELEVEN, halved, noise=0.02)
+    runs.loc[(runs["sequence"] == "03") & (runs["method"] == "masked"), "se3"] *= 40
+    text = findings.findings_of(runs, comparisons.comparisons_of(runs), "made up", False)
+    assert "without 03, aligned ATE is 0.5" in text
 
 
 @pytest.mark.parametrize("estimators", [["thesis"], ["inliers", "thesis"], ["thesis", "refined"]])
 def test_findings_say_if_the_estimator_that_usually_decides_was_not_run(estimators):
     runs = runs_of(ELEVEN[:6], halved, estimators=estimators)
-    text = findings.text(runs, compare.comparisons(runs), "made up", False)
+    text = findings.findings_of(runs, comparisons.comparisons_of(runs), "made up", False)
     (first, usual) = (ESTIMATORS[name] for name in (estimators[0], "refined"))
-    said = f"The {usual}, which usually decides, was not run. So the {first} decides"
-    assert (said in text) == ("refined" not in estimators)
+    judge = usual if "refined" in estimators else first
+    assert f"The {judge} decides." in text
+    assert (f"The {usual}, which usually decides, was not run." in text) == (judge != usual)
 
 
 def drawn_by_cells(runs):
@@ -278,7 +310,7 @@ def drawn_by_cells(runs):
     save = SimpleNamespace(save_figure=lambda figure, name, note: figures.update({name: figure}))
     given = {"runs": runs, "SEQUENCES": sorted(runs["sequence"].unique()), "note": ""}
     modules = {"np": np, "pd": pd, "chapter4": chapter4, "frames": frames, "style": style}
-    modules |= {"section_4_2": section_4_2, "compare": compare}
+    modules |= {"section_4_2": section_4_2, "comparisons": comparisons, "ratios": ratios}
     names = given | modules | {"artefacts": save}
     for number in ("58", "54", "18", "55", "56", "26", "27"):
         exec(cells("08_results.ipynb", "code")[f"08-{number}"], names)
@@ -297,24 +329,24 @@ def drawn_by_cells(runs):
 )
 def test_figures_of_equal_and_of_noisy_errors_can_be_drawn(names, noise, sources):
     runs = runs_of(names, lambda *_: 0.1, noise=noise, sources=sources)
-    table = compare.comparisons(runs)
+    table = comparisons.comparisons_of(runs)
     if sources == ("",):
         assert problems(chapter4.figure_against_width(*widths_of(runs), "rmse")) == []
         figures = drawn_by_cells(runs)
         assert set(figures) == {f"figure_4_{number:02d}" for number in (7, 13, 14, 15, 16)}
         assert [name for name, figure in figures.items() if problems(figure)] == []
-    figure = comparison.figure_comparison(table)
+    figure = comparison.figure_of_ratios(table).content
     figure.draw_without_rendering()
     assert all(edge > 0 for axes in figure.axes for edge in axes.get_xlim())
 
 
 def test_the_comparison_figure_shows_ratios_and_their_interval():
     lower = runs_of(ELEVEN, lambda name, method, _: 0.7 + 0.3 * (method != "masked"), noise=0.1)
-    table = compare.comparisons(lower)
-    axes = comparison.figure_comparison(table).axes[0]
+    table = comparisons.comparisons_of(lower)
+    axes = comparison.figure_of_ratios(table).content.axes[0]
     row = table[
         (table["estimator"] == "thesis")
-        & (table["metric"] == list(compare.JUDGING_METRICS)[0])
+        & (table["metric"] == list(comparisons.JUDGING_METRICS)[0])
         & table["tested"]
         & (table["method"] == "masked")
         & (table["reference"] == "baseline")
@@ -345,7 +377,7 @@ def test_the_curve_of_few_keypoints_shows_every_ratio():
 
 
 def test_the_figure_of_paths_shows_repetitions_and_their_errors():
-    runs = compare.of_method(runs_of(["00", "05"], lambda *_: 1.0), "baseline")
+    runs = comparisons.of_method(runs_of(["00", "05"], lambda *_: 1.0), "baseline")
     paths = {
         (row.sequence, row.run): AHEAD + [[0, 0, 0], [0, 0, 0], [row.repetition, 0, 0], [3, 4, 0]]
         for row in runs.itertuples()
@@ -364,7 +396,7 @@ def test_a_failed_run_is_marked_where_runs_are_drawn(failed):
     rows = (runs["method"] == "baseline") & (runs["sequence"] == "05")
     masked_rows = (runs["method"] == "masked") & (runs["sequence"] == "05")
     runs.loc[(rows | masked_rows) & (runs["repetition"] == 1), "failed"] = 50.0 * failed
-    of_all = compare.of_method(runs, "baseline")
+    of_all = comparisons.of_method(runs, "baseline")
     paths = {(row.sequence, row.run): AHEAD for row in of_all.itertuples()}
     truths = {"00": AHEAD, "05": AHEAD}
     for figure in (
@@ -379,7 +411,7 @@ def test_a_failed_run_is_marked_where_runs_are_drawn(failed):
 
 def test_bars_show_the_mean_of_each_method_and_its_repetitions():
     runs = runs_of(["00", "05"], lambda *_: 1.0, noise=0.3)
-    spread = compare.spread(compare.of_method(runs, "baseline"), "rmse")
+    spread = ratios.range_over_repetitions(comparisons.of_method(runs, "baseline"), "rmse")
     axes = drawn_by_cells(runs)["figure_4_13"].axes[0]
     bars = next(each for each in axes.containers if isinstance(each, BarContainer))
     assert [bar.get_height() for bar in bars] == pytest.approx(spread["mean"].tolist())

@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 from scipy.stats import ttest_1samp, wilcoxon
 
-from keypoint_study import compare
+from keypoint_study import comparisons, ratios
 from thesis import section_4_2
 
 EIGHT = [f"{number:02d}" for number in range(8)]
@@ -39,7 +39,7 @@ def primary(table):
 
 
 def ratio_of(rows, reference):
-    return compare.typical_ratio(compare.ratios(rows, reference, "rmse"))
+    return ratios.typical_ratio(ratios.ratios_of(rows, reference, "rmse"))
 
 
 def test_known_ratios_are_found_and_inverted_by_swapping():
@@ -59,7 +59,7 @@ def test_a_missing_or_zero_error_leaves_its_sequence_out(bad):
     runs.loc[(runs["sequence"] == "03") & (runs["method"] == "masked"), "rmse"] = bad
     result = ratio_of(*arms(runs, "masked", "baseline"))
     assert result["n"] == 7 and result["ratio"] == pytest.approx(0.5)
-    assert np.isnan(compare.typical_ratio([np.nan])["ratio"])
+    assert np.isnan(ratios.typical_ratio([np.nan])["ratio"])
 
 
 @pytest.mark.parametrize(
@@ -73,9 +73,10 @@ def test_a_missing_or_zero_error_leaves_its_sequence_out(bad):
 )
 def test_the_verdict_follows_the_interval(factor, verdict):
     masked, baseline = arms(runs_of({"masked": factor}), "masked", "baseline")
-    assert ratio_of(masked[masked["sequence"] < "06"], baseline)["verdict"] == verdict
-    five = ratio_of(masked[masked["sequence"] < "05"], baseline)
-    assert five["n"] == 5 and five["verdict"] == "too few sequences to tell"
+    for last, word in (("06", verdict), ("05", "too few sequences to tell")):
+        runs = pd.concat([masked, baseline])
+        row = primary(comparisons.comparisons_of(runs[runs["sequence"] < last])).iloc[0]
+        assert (row["n"], row["verdict"]) == (int(last), word)
 
 
 @pytest.mark.torture
@@ -107,7 +108,7 @@ def test_intervals_that_exclude_the_true_ratio_by_chance():
         for count in (6, 8, 11):
             studies = draw((2000, count))
             for kind in ("typical", "mean"):
-                interval = {"typical": compare.typical_interval, "mean": compare.mean_interval}
+                interval = {"typical": ratios.typical_interval, "mean": ratios.mean_interval}
                 ends = np.array([interval[kind](row)[-2:] for row in studies])
                 excluded = (ends[:, 0] > 0) | (ends[:, 1] < 0)
                 percent[name, kind, count] = 100 * excluded.mean()
@@ -120,20 +121,20 @@ def test_intervals_that_exclude_the_true_ratio_by_chance():
 
 
 def test_a_small_loss_everywhere_shows_beside_one_sequence_that_fails():
-    ratios = [1.024, 15.95, 1.171, 1.012, 1.014, 1.017, 1.101, 1.033]
-    result = compare.typical_ratio(ratios)
-    assert result["verdict"] == "higher" and 1.0 < result["low"] < result["ratio"] < 1.2
+    of_streets = [1.024, 15.95, 1.171, 1.012, 1.014, 1.017, 1.101, 1.033]
+    result = ratios.typical_ratio(of_streets)
+    assert 1.0 < result["low"] < result["ratio"] < 1.2
     assert result["above"] == result["n"] == 8
     assert result["mean"] > 1.4 and result["mean_low"] < 1 < result["mean_high"]
     reach = np.log(result["mean_high"] / result["mean"])
     assert np.log(result["detectable"]) > reach  # half a study's power would be the reach
-    assert compare.typical_ratio([1.0, 2.0])["above"] == 1
+    assert ratios.typical_ratio([1.0, 2.0])["above"] == 1
 
 
 @pytest.mark.parametrize("n", [6, 8, 11])
 def test_the_interval_holds_what_the_signed_rank_test_does_not_reject(n):
     values = np.random.default_rng(n).normal(0.3, 1, n)
-    estimate, low, high = compare.typical_interval(values)
+    estimate, low, high = ratios.typical_interval(values)
     assert low < estimate < high
     for centre, rejected in ((low, -1), (high, 1)):
         for side in (-1, 1):
@@ -146,29 +147,31 @@ def test_failures_are_counted_and_compared_apart():
     is_masked = runs["method"] == "masked"
     one_street = is_masked & (runs["sequence"] == "01")
     runs.loc[one_street, "failed"] = 10.0
-    row = primary(compare.comparisons(runs)).iloc[0]
+    row = primary(comparisons.comparisons_of(runs)).iloc[0]
     assert (row["failed"], row["reference_failed"]) == ("2 of 16", "0 of 16")
     assert (row["more_failures"], row["fewer_failures"]) == (1, 0)
     assert row["failures_verdict"] == row["verdict"] == "no clear difference"
     runs.loc[is_masked & (runs["sequence"] < "06"), "lost"] = 1
-    row = primary(compare.comparisons(runs)).iloc[0]
+    row = primary(comparisons.comparisons_of(runs)).iloc[0]
     assert (row["more_failures"], row["failures_verdict"]) == (6, "higher")  # 2 / 2**6
-    swapped = compare.failures(pd.Series([False] * 6, range(6)), pd.Series([True] * 6, range(6)))
+    swapped = comparisons.failures(
+        pd.Series([False] * 6, range(6)), pd.Series([True] * 6, range(6))
+    )
     assert swapped["failures_verdict"] == "lower" and swapped["fewer_failures"] == 6
-    few = compare.failures(pd.Series([True], ["00"]), pd.Series([False], ["00"]))
+    few = comparisons.failures(pd.Series([True], ["00"]), pd.Series([False], ["00"]))
     assert few["failures_verdict"] == "too few sequences to tell"
 
 
 def test_the_interval_is_students_t():
     values = np.random.default_rng(1).normal(3, 10, 11)
-    low, high = compare.mean_interval([*values, np.nan])
+    low, high = ratios.mean_interval([*values, np.nan])
     assert (low, high) == pytest.approx(tuple(ttest_1samp(values, 0).confidence_interval(0.95)))
-    assert np.isnan(compare.mean_interval([1.0, 2.0, np.nan])).all()
+    assert np.isnan(ratios.mean_interval([1.0, 2.0, np.nan])).all()
 
 
 def test_masks_are_compared_with_all_keypoints_and_every_control():
     factors = {"masked": 0.5, "mirrored": 1.0, "fewer": 0.25, "reduced": 3.0}
-    table = compare.comparisons(runs_of(factors))
+    table = comparisons.comparisons_of(runs_of(factors))
     pairs = set(zip(table["method"], table["reference"]))
     assert pairs == {
         ("baseline", "baseline"),
@@ -183,48 +186,49 @@ def test_masks_are_compared_with_all_keypoints_and_every_control():
     assert rows.loc[("masked", "mirrored", "thesis"), EIGHT].tolist() == pytest.approx([0.5] * 8)
     deciding = primary(table)
     assert set(deciding["estimator"]) == {"refined"}
-    assert list(deciding["metric"]) == list(compare.JUDGING_METRICS)
-    assert compare.overall(deciding["verdict"]) == "lower"
+    assert list(deciding["metric"]) == list(comparisons.JUDGING_METRICS)
+    assert comparisons.verdict_of(deciding) == "lower"
     alone = runs_of(factors, estimators=["inliers", "thesis"])  # the first that was run
-    assert set(primary(compare.comparisons(alone))["estimator"]) == {"inliers"}
-    against = table[table["decides"] & table["reference"].isin(compare.SEGMENTATION_FREE_CONTROLS)]
-    verdicts = against.set_index(["reference", "metric"])["verdict"]
-    assert set(verdicts["mirrored"]) == {"lower"} and set(verdicts["fewer"]) == {"higher"}
-    assert compare.overall(["lower", "higher"]) == "no clear difference"
-    assert compare.overall(["lower", compare.TOO_FEW]) == compare.overall([]) == compare.TOO_FEW
+    assert set(primary(comparisons.comparisons_of(alone))["estimator"]) == {"inliers"}
+    against = table[
+        table["decides"] & table["reference"].isin(comparisons.SEGMENTATION_FREE_CONTROLS)
+    ]
+    words = against.set_index(["reference", "metric"])["verdict"]
+    assert set(words["mirrored"]) == {"lower"} and set(words["fewer"]) == {"higher"}
+    assert comparisons.verdict_of(table[:0]) == "too few sequences to tell"
 
 
 def test_sources_are_compared_with_each_other():
     one, other = runs_of({"masked": 0.5}), runs_of({"masked": 0.25})
     other = other[other["method"] == "masked"].assign(source="other")
     runs = pd.concat([one, other])
-    assert compare.sources(runs) == ["net", "other"]
-    assert set(compare.of_source(runs, "other")["method"]) == {"baseline", "masked"}
-    table = compare.comparisons(runs)
+    assert comparisons.sources(runs) == ["net", "other"]
+    assert set(comparisons.of_source(runs, "other")["method"]) == {"baseline", "masked"}
+    table = comparisons.comparisons_of(runs)
     row = table[(table["source"] == "net") & (table["reference_source"] == "other")].iloc[0]
     assert row["ratio"] == pytest.approx(2)
 
 
 def test_the_tested_width_is_the_width_of_the_controls():
     narrow = runs_of({"masked": 0.5, "mirrored": 1.0}, width=5)
-    assert compare.tested_width(narrow) == 5
-    assert compare.tested_width(runs_of({"masked": 0.5}, width=7)) == 7  # the only width
-    assert compare.tested_width(runs_of({})) == 10
+    assert comparisons.tested_width(narrow) == 5
+    assert comparisons.tested_width(runs_of({"masked": 0.5}, width=7)) == 7  # the only width
+    assert comparisons.tested_width(runs_of({})) == 10
     # ready-made masks
-    assert compare.tested_width(runs_of({"masked": 0.5}).assign(dilation_width=np.nan)) is None
-    assert (compare.keypoints_left(narrow) == 505).all()
-    assert compare.tested_width(pd.concat([narrow, runs_of({"mirrored": 1.0}, width=7)])) == 10
+    assert comparisons.tested_width(runs_of({"masked": 0.5}).assign(dilation_width=np.nan)) is None
+    assert (comparisons.keypoints_left(narrow) == 505).all()
+    assert comparisons.tested_width(pd.concat([narrow, runs_of({"mirrored": 1.0}, width=7)])) == 10
 
 
 def test_sequences_far_off_the_mean_are_named():
     runs = runs_of({"masked": lambda name: {"03": 6.0, "05": 0.1}.get(name, 1.0)})
-    rows = compare.comparisons(runs)
+    rows = comparisons.comparisons_of(runs)
     far_off = rows.loc[rows["method"] == "masked", "far_off"]
     assert set(far_off.map(tuple)) == {("03", "05")}
     # two sequences do not show which one is far off
-    assert compare.far_off(pd.Series({"00": 1.0, "01": 90.0})) == []
-    assert compare.far_off(pd.Series(dict.fromkeys(EIGHT, 2.9) | {"01": 1.0})) == []
-    assert compare.far_off(pd.Series({"00": 1.0, "01": 0.6, "02": 1.4, "03": 90.0})) == ["03"]
+    assert ratios.far_off(pd.Series({"00": 1.0, "01": 90.0})) == []
+    assert ratios.far_off(pd.Series(dict.fromkeys(EIGHT, 2.9) | {"01": 1.0})) == []
+    assert ratios.far_off(pd.Series({"00": 1.0, "01": 0.6, "02": 1.4, "03": 90.0})) == ["03"]
 
 
 def parts_of(

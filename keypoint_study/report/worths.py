@@ -1,0 +1,107 @@
+"""Table and figure of what a keypoint of each choice is worth (keypoint_study/worth.py)."""
+
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from keypoint_study import ratios
+from keypoint_study.report import style, texts
+from keypoint_study.report.style import COLUMN_WIDTH, PAGE_WIDTH, Artefact
+from keypoint_study.verdicts import LEVEL, MIN_SEQUENCES
+from keypoint_study.worth import DECIDING, FIELD, SPLIT, typical_worths
+
+SHOWN = ("direction", "rotation")
+REACH = 8  # of the figure's axis, from 1 / REACH to REACH; a street beyond it is drawn at the edge
+DOT: dict[str, Any] = {"color": "#555555", "markersize": 4, "alpha": 0.45, "markeredgewidth": 0}
+
+
+def table_of_worths(worths: pd.DataFrame) -> Artefact:
+    """Return one row a choice and number, for readers: typical worths, intervals and the verdict.
+
+    worths: of `worth.worths_of`. A cell says "0.51 (0.20-0.67), 7 of 8 below 1".
+    """
+    lines = []
+    for row in typical_worths(worths).to_dict("records"):
+        line = {
+            "choice": row["choice"],
+            "drawn": row["number"] or "all",
+            "keypoints": f"{row['keypoints']:.0f}",
+        }
+        for split in SPLIT:
+            for motion in SHOWN:
+                line[f"{motion}, by {split}"] = cell(row, f"{motion}_{split}")
+        lines.append(line | {"a keypoint tells": row["verdict"]})
+    return Artefact(
+        "worth",
+        "What a keypoint is worth, in numbers",
+        f"Typical worth of the sequences, from {MIN_SEQUENCES} on with its {LEVEL} % interval, and "
+        f"the number of sequences with less than random keypoints. By fields: squares of {FIELD} "
+        "pixels go into one half as a whole, so what neighbours share counts once. By points: "
+        "keypoint by keypoint. A keypoint tells less or more only if both splits say so, for "
+        "direction and rotation. worth_runs.csv has every sequence.",
+        pd.DataFrame(lines),
+    )
+
+
+def for_paper(table: pd.DataFrame) -> pd.DataFrame:
+    """Return the columns of `table_of_worths` for a paper, without the counts of sequences."""
+    numbers = [name for name in table if name.startswith(SHOWN)]
+    short = table[numbers].apply(lambda cells: cells.str.partition(",")[0])
+    return table[["choice"]].join(short).assign(**{"a keypoint tells": table["a keypoint tells"]})
+
+
+def cell(row: dict, name: str) -> str:
+    """Return a typical worth of `worth.typical_worths` as text."""
+    ends = {end: row[f"{name}_{end}"] for end in ("low", "high")}
+    return (
+        f"{texts.short({'ratio': row[name], **ends})}, {row[f'{name}_below']} of {row['n']} below 1"
+    )
+
+
+def figure_of_worths(
+    worths: pd.DataFrame, number: int = DECIDING, width: float = PAGE_WIDTH
+) -> Artefact:
+    """Draw the worth of each choice on every sequence, by fields, and the typical worth.
+
+    number: of keypoints, one of those in `worths`. width: inches; in one column the panels are
+    below each other.
+    """
+    shown = worths[(worths["number"] == number) & (worths["split"] == "fields")]
+    order = list(shown["choice"].unique())
+    rows = 1 if width > COLUMN_WIDTH else len(SHOWN)
+    height = rows * (0.9 + 0.28 * len(order))
+    drawing, panels = style.new_figure(
+        rows, len(SHOWN) // rows, height, width, sharex=True, sharey=True, squeeze=False
+    )
+    for panel, motion in zip(panels.flat, SHOWN, strict=True):
+        style.ratio_axis(panel.xaxis, [1 / REACH, REACH])
+        for place, choice in enumerate(order):
+            values = shown.loc[shown["choice"] == choice, motion]
+            beyond = (values < 1 / REACH) | (values > REACH)
+            for marker, part in (("o", values[~beyond]), ("D", values[beyond])):
+                places = np.full(len(part), place - 0.1)
+                panel.plot(part.clip(1 / REACH, REACH), places, marker, **DOT)
+            estimate, *interval = np.exp(ratios.typical_interval(np.log(values)))
+            if not np.isnan(interval).any():
+                look = style.interval_style(style.MASKED, "|")
+                panel.plot(np.clip(interval, 1 / REACH, REACH), [place + 0.2] * 2, **look)
+            panel.plot(estimate, place + 0.2, "D", color=style.MASKED, markersize=4)
+        panel.axvline(1, color="black", linewidth=0.8)
+        panel.grid(axis="y", visible=False)
+        panel.set_title(f"{motion}, {number or 'all'} keypoints")
+        panel.set_yticks(range(len(order)), order, fontsize=8)
+        panel.set_ylim(len(order) - 0.5, -0.7)
+    for panel in panels[-1]:
+        panel.set_xlabel("worth of a keypoint (random: 1)", fontsize=8)
+    return Artefact(
+        "worth",
+        "What a keypoint is worth",
+        "How much a keypoint of each choice tells about the motion of a step, without ground truth. "
+        "Keypoints are divided into two halves, and each half gives a motion: the less both differ, "
+        "the more a keypoint tells. As many random keypoints have 1; a worth of 0.5 needs twice as "
+        "many keypoints for the same precision. Grey dots are sequences, those drawn as diamonds lie "
+        f"beyond the axis; the coloured mark is their typical worth, from {MIN_SEQUENCES} sequences "
+        f"on with its {LEVEL} % interval. Refined estimator, {number or 'all'} keypoints, by fields.",
+        drawing,
+    )
