@@ -88,31 +88,6 @@ def test_tables_of_the_thesiss_numbers_equal_the_thesiss(
     ] == [10, 11]
 
 
-def test_the_literal_procedure_is_that_of_repetition_0():
-    runs = runs_of(["00"], lambda *_: 1.0)
-    masked = (runs["estimator"] == "thesis") & (runs["method"] == "masked")
-    # the mean is lowest at width 10, repetition 0 at width 5
-    for width, errors in ((5, [0.6, 3, 3]), (10, [0.7, 0.1, 0.1]), (15, [1, 1, 1])):
-        runs.loc[masked & (runs["dilation_width"] == width), "rmse"] = errors
-    shown = section_4_2.table_of_change(*widths_of(runs), NEVER_SHUFFLED, "rmse", "thesis").iloc[0]
-    assert shown["change (%)"] == pytest.approx(-70)
-    assert shown["change (%), one run each"] == pytest.approx(-40)
-
-
-def test_masks_that_do_nothing_are_told_beside_the_literal_procedure():
-    runs = runs_of(ELEVEN, lambda *_: 1.0, noise=0.2)
-    baseline = {"baseline": [None]}
-    options = {"estimators": ["thesis"], "repetitions": 30, "noise": 0.2}
-    shuffled = made_up.runs(ELEVEN, lambda *_: 1.0, baseline, **options)
-    table = section_4_2.table_of_change(*widths_of(runs), shuffled, "rmse", "thesis").set_index(
-        "sequence"
-    )
-    studies = section_4_2.null_distribution(shuffled, 3, "rmse")
-    null = table["change (%), one run each, if masks did nothing"]
-    assert null["mean"] == pytest.approx(studies.mean(axis=1).mean(), abs=0.006)
-    assert null["mean"] < -5 and null["sequences improved"] > 6  # the best of three widths
-
-
 def test_failed_runs_are_counted():
     runs = runs_of(ELEVEN, halved)
     failing = (runs["sequence"] == "03") & (runs["method"] == "masked")
