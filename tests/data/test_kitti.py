@@ -224,5 +224,5 @@ def test_real_drives_agree_with_their_odometry_files(kitti_real, number):
     np.testing.assert_allclose(
         sequence.times, trajectories.read_times(files / "times.txt"), atol=2e-6
     )
-    expected = kitti_odometry.read_intrinsics(files / "calib.txt", "P2")
+    expected = kitti_odometry.read_camera(files / "calib.txt", "P2").matrix
     assert np.array_equal(sequence.intrinsics, expected) and sequence.frame(49).shape == (375, 1242)

@@ -94,8 +94,10 @@ def test_messages_count_all_lines_of_a_file(path, function, text, line):
 def test_any_text_as_calibration(path, text, with_key, camera):
     if with_key and isinstance(text, str):
         text = f"P2: {text}\nP0: {text}"
-    matrix = read(kitti_odometry.read_intrinsics, path, text, camera)
-    if matrix is not None:
+    read_camera = kitti_odometry.read_camera
+    lens = read(read_camera, path, text, camera)
+    if lens is not None:
+        matrix = lens.matrix
         assert matrix.shape == (3, 3) and np.isfinite(matrix).all() and (np.diag(matrix) > 0).all()
         assert np.array_equal(matrix[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]], [0, 0, 0, 0, 1])
 

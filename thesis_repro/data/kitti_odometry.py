@@ -54,20 +54,15 @@ def files(folder: Path, camera: str | None) -> Files:
 
 
 def read_camera(path: Path, key: str = "P0") -> Camera:
-    """Read the camera of a line such as P0, see `read_intrinsics`."""
-    return Camera(read_intrinsics(path, key), np.empty(0))
-
-
-def read_intrinsics(path: Path, key: str = "P0") -> np.ndarray:
-    """Camera matrix (Equation 2.4), (3, 3), pixels: the first three columns of a line.
+    """Read the camera (Equation 2.4) of a line such as P0: its first three columns.
 
     Raises InputError if the line is missing, or if the camera has distortion or skew.
     """
-    return _projection(path, key)[:, :3]
+    return Camera(_projection(path, key)[:, :3], np.empty(0))
 
 
 def _projection(path: Path, key: str) -> np.ndarray:
-    """Return the projection matrix, (3, 4), of a line. Raises what `read_intrinsics` raises."""
+    """Return the projection matrix, (3, 4), pixels, of a line."""
     form = ", f 0 u 0 0 f v 0 0 0 1 0, of a camera without distortion"
     projection = read_line(path, f"{key}:", 12, form).reshape(3, 4)
     if not is_camera_matrix(projection[:, :3]):

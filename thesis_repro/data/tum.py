@@ -4,6 +4,7 @@ The camera is that of calib.txt, written as for own frames, or known from the fo
 """
 
 import re
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -38,33 +39,35 @@ def poses(folder: Path) -> Path:
 def files(folder: Path, camera: str | None) -> Files:
     """Files of a sequence. camera: "rgb", the only one."""
     camera_folder(folder, ("rgb",), camera)
-    frames = [folder / name for _, name in _rows(folder / LIST)]
+    listed = _rows(folder / LIST)
+    frames = [folder / name for _, name in listed]
     missing = [frame for frame in frames if not frame.is_file()]
     if missing:
         raise InputError(f"{missing[0]}: no such file, but {LIST} lists it")
+    times = np.array([time for time, _ in listed])
     return Files(
-        frames, folder / "calib.txt", _read_camera, folder / LIST, poses(folder), _read_times
+        frames,
+        folder / "calib.txt",
+        _read_camera,
+        folder / LIST,
+        poses(folder),
+        lambda path: times,
     )
 
 
-def _rows(path: Path) -> list[list[str]]:
-    """Return time and name of each frame. Raises InputError for another line."""
-    rows = [line.split() for line in read_text(path).splitlines() if not line.startswith("#")]
-    rows = list(filter(None, rows))
-    if not rows or any(len(row) != 2 for row in rows):
-        raise InputError(f"{path}: must hold a time and the name of a frame in each line")
-    return rows
-
-
-def _read_times(path: Path) -> np.ndarray:
-    """Times of the frames, (n,), seconds. Raises InputError unless they increase."""
+def _rows(path: Path) -> list[tuple[float, str]]:
+    """Return time and name of each frame. Raises InputError unless the times increase."""
+    lines = [line.split() for line in read_text(path).splitlines() if not line.startswith("#")]
     try:
-        times = np.array([time for time, _ in _rows(path)], np.float64)
+        rows = [(float(time), name) for time, name in filter(None, lines)]
     except ValueError:
-        times = np.zeros(2)
-    if not (np.diff(times) > 0).all():
-        raise InputError(f"{path}: must hold times that increase, in seconds, before the names")
-    return times
+        rows = []
+    if not rows or not all(row[0] < later[0] for row, later in pairwise(rows)):
+        raise InputError(
+            f"{path}: must hold a time in seconds, later than the one before, and the name of a frame in "
+            "each line"
+        )
+    return rows
 
 
 def _read_camera(path: Path) -> Camera:

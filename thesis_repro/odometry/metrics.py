@@ -193,17 +193,11 @@ MIN_STEPS = 10  # of a path, to say what its poses are
 OPENGL = np.diag([1.0, -1, -1, 1])
 
 
-def _with_quaternions(poses: np.ndarray, order: list[int]) -> np.ndarray:
-    """Poses whose quaternions (x, y, z, w) have their numbers in another order."""
+def _with_quaternions(poses: np.ndarray, order: list[int], sign: int = 1) -> np.ndarray:
+    """Poses whose quaternions (x, y, z, w) have another order, or those of inverse rotations."""
     changed = poses.copy()
-    quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+    quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat() * [sign, sign, sign, 1]
     changed[:, :3, :3] = Rotation.from_quat(quaternions[:, order]).as_matrix()
-    return changed
-
-
-def _with_inverse_rotations(poses: np.ndarray) -> np.ndarray:
-    changed = poses.copy()
-    changed[:, :3, :3] = poses[:, :3, :3].swapaxes(1, 2)
     return changed
 
 
@@ -223,7 +217,7 @@ CONVENTIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
         lambda poses: _with_quaternions(poses, [3, 0, 1, 2])
     ),
     "have rotations of the world to the camera beside positions of the camera; invert the rotations": (
-        _with_inverse_rotations
+        lambda poses: _with_quaternions(poses, [0, 1, 2, 3], -1)
     ),
     "are in reverse order": lambda poses: poses[::-1],
 }
