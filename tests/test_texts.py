@@ -6,6 +6,7 @@ import pytest
 
 import thesis_repro as tr
 import write_texts
+from keypoint_study import verdicts
 from thesis_repro.odometry import metrics
 
 
@@ -18,14 +19,38 @@ def test_texts_in_git_are_those_of_the_tables_and_short(template, words):
     assert len(written.split()) <= words
 
 
-def test_a_text_says_what_the_runs_say(monkeypatch):
-    runs = write_texts.read_table(f"{write_texts.REAL}runs")
-    masked = runs["method"] == "masked"
-    lower = runs.assign(**{name: runs[name].where(~masked, 1e-3) for name in ("se3", "rotation")})
-    monkeypatch.setattr(write_texts, "read_table", {f"{write_texts.REAL}runs": lower}.get)
+@pytest.fixture
+def with_masks(monkeypatch):
+    """A function that multiplies the errors with masks, on the given streets or on all."""
+    read = write_texts.read_table
+
+    def change(factor, streets=slice(None)):
+        runs = read(f"{write_texts.REAL}runs")
+        runs = runs[runs["sequence"].isin(sorted(runs["sequence"].unique())[streets])].copy()
+        masked = runs["method"] == "masked"
+        runs.loc[masked, ["se3", "rotation"]] *= factor
+        monkeypatch.setattr(
+            write_texts, "read_table", lambda name: runs if name.endswith("/runs") else read(name)
+        )
+        write_texts.compared.cache_clear()
+
+    yield change
     write_texts.compared.cache_clear()
-    assert write_texts.verdict() == "lower"
-    write_texts.compared.cache_clear()
+
+
+@pytest.mark.parametrize(
+    "factor, streets, outcome",
+    [
+        (1e-3, slice(None), verdicts.LOWER),
+        (1e3, slice(None), verdicts.HIGHER),
+        (1, slice(4), verdicts.TOO_FEW),
+    ],
+)
+def test_texts_say_every_outcome_of_the_runs(with_masks, factor, streets, outcome):
+    with_masks(factor, streets)
+    assert write_texts.verdict() == outcome
+    for template in ("README.md.j2", "answer.md.j2"):
+        assert f"errors are {write_texts.ERRORS[outcome]} those" in write_texts.render(template)
 
 
 @pytest.mark.real

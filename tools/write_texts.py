@@ -10,7 +10,7 @@ from typing import Any
 
 import pandas as pd
 
-from keypoint_study import comparisons, ratios
+from keypoint_study import comparisons, ratios, verdicts
 from keypoint_study import worth as worths
 from keypoint_study.report import texts
 from thesis import few_keypoints
@@ -24,6 +24,21 @@ TEMPLATES = ROOT / "docs" / "templates"
 WRITTEN = {"README.md.j2": ROOT / "README.md"}
 WRITTEN |= {f"{name}.md.j2": ROOT / f"docs/{name}.md" for name in ("answer", "options")}
 REAL = "kitti_excerpts/"  # tables on real frames
+# how the texts say a verdict on the worth of a keypoint, and on errors
+TOO_FEW = "of too few streets to be compared with"
+TELLS = {
+    verdicts.LESS: "less than",
+    verdicts.MORE: "more than",
+    verdicts.AS_MUCH: "as much as",
+    verdicts.NO_CLEAR_DIFFERENCE: "not clearly more or less than",
+    verdicts.TOO_FEW: TOO_FEW,
+}
+ERRORS = {
+    verdicts.LOWER: "lower than",
+    verdicts.HIGHER: "higher than",
+    verdicts.NO_CLEAR_DIFFERENCE: "not clearly different from",
+    verdicts.TOO_FEW: TOO_FEW,
+}
 NAMES = ("sequence", "row", "source", "metric", "estimator")  # columns of texts, if empty, too
 
 
@@ -145,7 +160,8 @@ def with_interval(row: dict[str, Any]) -> str:
 
 def render(template: str) -> str:
     """Return the text that a template in docs/templates gives."""
-    return texts.render(template, **{function.__name__: function for function in FUNCTIONS})
+    named = {function.__name__: function for function in FUNCTIONS}
+    return texts.render(template, **named, tells=TELLS, errors=ERRORS)
 
 
 # that templates call
