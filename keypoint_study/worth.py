@@ -102,7 +102,7 @@ def worth_of(
     steps = steps[spaced.round().astype(int)]
     shared = SharedCalls()
     rows = []
-    for index in progress(steps, f"worth of keypoints, {sequence.name}"):
+    for index in steps:
         random, of_choices = tracked(sequence, int(index), chosen, shared, calls)
         halves_of_random = cache(partial(_halves, random))
         for (name, number), tracks in of_choices.items():
@@ -288,8 +288,17 @@ def worths_of(
             chosen, _ = choices_of(sequence, sources, width, number, **options)
             calls.append((stage / f"{number}.csv", sequence, chosen, own))
     missing = [call for call in calls if not call[0].is_file()]
-    with open_pool(processes, scheduler) as pool:
-        reasons = list(filter(None, pool.run(_measure_one, missing)))
+    # the first step of a sequence compiles, so it says nothing about the time of the others
+    steps = [min(len(sequence), MAX_STEPS) for _, sequence, *_ in missing]
+    reasons = []
+    with (
+        open_pool(processes, scheduler) as pool,
+        progress(None, "worth of keypoints", total=sum(steps), unit="step") as bar,
+    ):
+        for count, reason in zip(steps, pool.run(_measure_one, missing), strict=True):
+            if reason:
+                reasons.append(reason)
+            bar.update(count)
     tables = [pd.read_csv(file, dtype={"sequence": str}) for file, *_ in calls if file.is_file()]
     if not tables:
         raise InputError(reasons[0])

@@ -203,7 +203,12 @@ def study(options: Any) -> int:
         with_runs = set(outcome.table["source"])
         measured = [source for source in planned.sources if source.name in with_runs]
         try:
-            worths = replace(planned, sources=tuple(measured)).worths(folder, *workers)
+            if not options.without_worth:
+                program.log.info(
+                    "next is the worth of keypoints, which takes about as long as the runs "
+                    "(--without-worth leaves it out)"
+                )
+                worths = replace(planned, sources=tuple(measured)).worths(folder, *workers)
         except InputError as error:  # the runs are there, so their page is written
             warnings += _warn([f"no worth of keypoints: {error}"])
         page = study_report.write(planned, outcome.table, folder, warnings, worths)
