@@ -25,7 +25,7 @@ export JUPYTER_PREFER_ENV_PATH := 1
 export PYDEVD_DISABLE_FILE_VALIDATION := 1
 unexport PYTHONHOME PYTHONDONTWRITEBYTECODE PYTHONSTARTUP JUPYTER_PATH CDPATH TF_USE_LEGACY_KERAS XLA_FLAGS TF_XLA_FLAGS
 
-.PHONY: help setup figures notebooks page evidence trainings test torture lint lab bench weights pins clean check-data
+.PHONY: help setup figures book notebooks page evidence trainings test torture lint lab bench weights pins clean check-data
 help:
 	@echo "make figures     write every table and figure to figures/, from embedded data, or from KITTI=/path CITYSCAPES=/path"
 	@echo "                 (KITTI_SEMANTIC=/path: also test the label maps); size: PROFILE=smoke|lab|demo|thesis, or single:"
@@ -39,7 +39,8 @@ help:
 	@echo "make trainings   after make figures: train nine more networks, and compare masks from all ten (some ten minutes)"
 	@echo "make bench       measure the relative cost of odometry and network (KITTI=/path), into build/bench.json"
 	@echo "make weights     train the shipped model anew into build/shipped, CAMVID=/path KITTI_SEMANTIC=/path PSEUDO=/path"
-	@echo "make page, pins  write page, README and docs/answer.md anew from the tables in git; resolve the pins of environment.txt anew"
+	@echo "make book        after make figures: write all of its book, with the reference, into build/; a warning is an error"
+	@echo "make page, pins  write gallery, README and docs/answer.md anew from the tables in git; resolve the pins of environment.txt anew"
 	@echo "make setup       install the pinned packages into .venv (GPU=1: and CUDA); make clean: delete .venv and all results"
 
 # uv takes a third of pip's time, but ignores pip's settings, so pip follows if uv reaches no index. The options in PIP
@@ -63,9 +64,11 @@ setup: .venv/ready $(if $(filter 1,$(GPU)),.venv/ready-gpu)
 
 figures: setup
 	@$(BIN)/python -m thesis.figures
+book: setup
+	@$(BIN)/python -m thesis.book
 page: setup
 	@$(BIN)/python tools/write_texts.py
-	@$(BIN)/python -m thesis.page
+	@$(BIN)/python -m thesis.gallery
 
 # Which notebook needs what; `thesis.figures` runs this with the folder of the run. A notebook is executed again if one that
 # it needs was, or if the digests of the data or of its code have changed (thesis/checked.py, thesis/used.py). With real

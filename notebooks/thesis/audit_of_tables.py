@@ -14,7 +14,7 @@ from scipy.stats import binomtest
 from keypoint_study import comparisons, ratios
 from thesis import section_4_2
 from thesis.audit import METRICS, measurement, ratio, share
-from thesis.captions import REPORTED
+from thesis.reported import REPORTED
 from thesis_repro.data.cityscapes import LABELS
 
 # the thesis's changes in percent, one row a sequence

@@ -1,4 +1,4 @@
-"""Execute the notebooks of a run, and write its page: what `make figures` does.
+"""Execute the notebooks of a run, and write its gallery and book: what `make figures` does.
 
 The Makefile knows which notebook needs what. This holds the lock of the run while make works.
 """
@@ -8,14 +8,14 @@ import platform
 import subprocess
 import sys
 
-from thesis import checked, page, trainings, used
+from thesis import book, checked, gallery, trainings, used
 from thesis.settings import ROOT, Settings, read_settings
 from thesis_repro.running import program, provenance
 from thesis_repro.running.files import write_text
 
 
 def main() -> int:
-    """Execute what is not up to date, write the page, and return make's status.
+    """Execute what is not up to date, write gallery and book, and return make's status.
 
     A notebook that fails does not stop those that do not need it. Raises InputError if another run
     uses the folder.
@@ -31,7 +31,8 @@ def main() -> int:
             return 1
         used.record(settings.build)
         status = _execute(settings)
-        page.update(settings, settings.published)
+        gallery.update(settings)
+        status = book.build(settings) or status
     if note := trainings.network_note(settings):
         print(note)
     return status

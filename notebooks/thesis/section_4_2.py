@@ -21,7 +21,7 @@ from keypoint_study.best_width import (
 )
 from keypoint_study.jobs import Job, repeated
 from keypoint_study.methods import AS_SLAM_SYSTEMS
-from thesis.captions import REPORTED
+from thesis.reported import REPORTED
 
 __all__ = [
     "best_widths",

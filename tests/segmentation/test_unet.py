@@ -1,7 +1,7 @@
 import pytest
 
-from thesis.captions import REPORTED
 from thesis.diagrams import summary_rows
+from thesis.reported import REPORTED
 from thesis_repro.errors import InputError
 from thesis_repro.segmentation.unet import build_unet
 

@@ -20,7 +20,7 @@ from keypoint_study import comparisons, ratios, verdicts
 from keypoint_study.jobs import ESTIMATORS
 from keypoint_study.report import comparison, findings, html, latex, style, texts
 from thesis import chapter4, few_keypoints, frames, section_4_2
-from thesis.captions import REPORTED
+from thesis.reported import REPORTED
 from thesis_repro.errors import one_line
 
 AHEAD = np.array([[0, 0, z] for z in range(4)])  # true positions, metres

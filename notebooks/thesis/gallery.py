@@ -1,0 +1,154 @@
+"""The gallery: all figures and tables of a run on one page of Markdown, README.md beside them."""
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from keypoint_study.report import texts
+from thesis import captions, timing
+from thesis.reported import REPORTED
+from thesis.settings import ROOT, Settings, read_settings
+from thesis_repro.running import program, provenance
+from thesis_repro.running.files import atomic, write_text
+
+REAL = "kitti_excerpts"  # folder of the evidence on real frames (tools/evidence.py)
+REAL_CHAPTER = "Chapter 4 on real frames"
+ENDINGS = {"figure": (".svg", ".webp"), "table": (".md",), "text": (".md",)}
+DEFAULTS = {"thesis": None, "needs": None, "rows": 0}  # what only some artefacts have
+
+
+def update(settings: Settings) -> None:
+    """Copy the figures and tables of a run to where they are read, with their gallery.
+
+    Deletes temporary files of killed runs. Raises InputError if another run uses the folder.
+    """
+    folder = settings.published
+    with provenance.claimed(settings.build / "notebooks"):
+        provenance.sweep(settings.build)
+        if folder.is_dir():
+            provenance.sweep(folder)
+        for name, path in _drawn(settings).items():
+            with atomic(folder / name) as temporary:
+                shutil.copyfile(path, temporary)
+        write(settings)
+
+
+def _drawn(settings: Settings) -> dict[Path, Path]:
+    """Return the files that a run has drawn by name, and those in git that show no data."""
+    files = {path.relative_to(settings.figures): path for path in settings.figures.rglob("*.*")}
+    for name in captions.CONSTANT:
+        for path in (ROOT / "figures").glob(f"{name}.*"):
+            files.setdefault(Path(path.name), path)
+    return files
+
+
+def write(settings: Settings) -> None:
+    """Write the gallery beside the published figures of a run."""
+    write_text(settings.published / "README.md", text(settings))
+
+
+def text(settings: Settings) -> str:
+    """Return the gallery, made from the published files of a run.
+
+    That of the figures in git begins with chapter 4 on real frames.
+    """
+    chapters = {}
+    if settings.figures_in_git:
+        chapters[REAL_CHAPTER] = _of_real_frames(settings)
+    for title, artefacts in (captions.CHAPTERS | {"Beyond the thesis": captions.ADDED}).items():
+        chapters[title] = _described(artefacts, settings, settings.published)
+    return texts.render("gallery.md.j2", settings=settings, chapters=chapters, real=REAL_CHAPTER)
+
+
+def _of_real_frames(settings: Settings) -> list[dict[str, Any]]:
+    """Return the described artefacts of the evidence on real frames that is in git."""
+    few, others = (
+        [artefact for artefact in captions.ADDED if artefact["name"] in names]
+        for names in (["few_keypoints"], ["comparison", "widths"])
+    )
+    chapter = [*few, *captions.CHAPTERS["Chapter 4: results"], *others]
+    real = replace(settings, kitti_is_embedded=False)
+    described = _described(chapter, real, settings.published / REAL)
+    for artefact in described:
+        artefact["files"] = [f"{REAL}/{name}" for name in artefact["files"]]
+    return [artefact for artefact in described if artefact["files"]]
+
+
+def _described(
+    artefacts: list[dict[str, Any]], settings: Settings, folder: Path
+) -> list[dict[str, Any]]:
+    """Return artefacts with the values that the template needs.
+
+    These are the names of their files (none if they were not made), a number of the thesis, a table
+    in Markdown with its number of rows, an alternative text, and what the thesis reports.
+    """
+    numbers = beside_the_thesis(folder)
+    described = []
+    for artefact in artefacts:
+        name, kind = artefact["name"], artefact["kind"]
+        paths = [path for end in ENDINGS[kind] if (path := folder / f"{name}{end}").is_file()]
+        values: dict[str, Any] = {
+            "files": [path.name for path in paths],
+            "number": captions.number(artefact),
+            "seen": captions.SEEN.get(name),
+        }
+        if paths and kind == "table":
+            values["table"] = paths[0].read_text(encoding="utf-8")
+            values["rows"] = sum(line.startswith("|") for line in values["table"].split("\n")) - 2
+        if thesis := artefact.get("thesis"):
+            values["thesis"] = _beside(thesis, settings, numbers.get(name))
+        described.append(DEFAULTS | artefact | values)
+    return described
+
+
+def _beside(
+    thesis: dict[str, Any], settings: Settings, numbers: dict[str, Any] | None
+) -> dict[str, Any]:
+    """Return what the thesis reports beside an artefact and what this run gives, as texts.
+
+    thesis: the templates, see `captions`. numbers: of this run, or None if it has none.
+    """
+    fill = texts.TEMPLATES.from_string
+    embedded = {"runs": settings.kitti_is_embedded, "training": settings.cityscapes_is_embedded}
+    return {
+        "text": fill(thesis["text"]).render(REPORTED),
+        "here": numbers is not None and fill(thesis["here"]).render(numbers),
+        "embedded": embedded.get(thesis["data"], False),
+    }
+
+
+def beside_the_thesis(folder: Path) -> dict[str, Any]:
+    """Return a run's numbers for artefacts whose numbers the thesis reports in its text.
+
+    folder: of its figures. Their form is {name of the artefact: numbers}. A name is missing if its
+    file was not written.
+    """
+    numbers: dict[str, Any] = {}
+    history = _table(folder / "figure_4_01.csv")
+    if len(history):
+        best, last = history.loc[history["val_loss"].idxmin()], history.iloc[-1]
+        numbers["figure_4_01"] = {"epochs": len(history), "best": dict(best), "last": dict(last)}
+    chosen = _table(folder / "table_4_1.csv")
+    if "mean keypoints" in chosen:
+        numbers["figure_4_07"] = {"keypoints": chosen["mean keypoints"].clip(lower=1)}
+    seconds = _table(folder / "timings" / "seconds.csv")
+    if len(seconds):
+        numbers["figure_4_17"] = {"saved": 0 - timing.time_savings(seconds)}
+    return numbers
+
+
+def _table(path: Path) -> pd.DataFrame:
+    """Return a CSV file as a table; an empty one if there is no such file."""
+    return pd.read_csv(path).convert_dtypes() if path.is_file() else pd.DataFrame()
+
+
+def main() -> None:
+    """Write the gallery anew from published figures, by default those in git."""
+    write(read_settings())
+
+
+if __name__ == "__main__":
+    program.run_main(main)

@@ -1,0 +1,113 @@
+"""The gallery of a run, on a figures folder of made-up files."""
+
+import re
+from dataclasses import replace
+
+import pandas as pd
+import pytest
+from cells import NOTEBOOKS, cells
+
+from keypoint_study.report import style
+from thesis import captions, gallery
+from thesis.settings import ROOT, read_settings
+
+ARTEFACTS = [*captions.OF_THESIS, *captions.ADDED]
+FIGURES = [artefact for artefact in ARTEFACTS if artefact["kind"] == "figure"]
+TABLE = pd.DataFrame({"sequence": ["00", "01"], "RMSE (m)": [0.5, 12]})
+
+
+@pytest.fixture
+def run(tmp_path):
+    """The settings of a run that has drawn every artefact."""
+    folders = {name: str(tmp_path / name.lower()) for name in ("BUILD", "FIGURES")}
+    settings = read_settings({f"THESIS_REPRO_{name}": path for name, path in folders.items()})
+    settings.figures.mkdir(parents=True)
+    (settings.build / "notebooks").mkdir()
+    for artefact in ARTEFACTS:
+        if artefact["kind"] == "table":
+            style.save_table(TABLE, settings.figures, artefact["name"], "a note")
+        else:
+            ending = {"figure": ".svg", "text": ".md"}[artefact["kind"]]
+            (settings.figures / f"{artefact['name']}{ending}").write_text("drawn")
+    return settings
+
+
+def test_it_has_every_artefact_in_the_order_of_the_thesis(run):
+    gallery.update(run)
+    text = (run.published / "README.md").read_text()
+    titles = re.findall(r"^### (?:\w+ \w+\.\d+\. )?(.+)$", text, re.MULTILINE)
+    assert titles == [artefact["title"] for artefact in ARTEFACTS] and len(captions.THESIS) == 41
+    links = re.findall(r"\]\(([^)]+)\)", text)
+    assert len(links) > 30 and all((run.published / link).is_file() for link in links)
+    assert (run.published / "figure_4_06.svg").read_text() == "drawn"
+    assert str(run.published.parent) not in text
+
+
+def test_missing_artefacts_are_listed_with_the_data_that_they_need(run):
+    for name in ("figure_4_06.svg", "table_3_2.md", "figure_3_05.svg", "figure_3_01.svg"):
+        (run.figures / name).unlink()
+    real = replace(run, kitti_is_embedded=False)
+    gallery.update(real)
+    missing = re.findall(r"^Missing: (.*)\.$", (run.published / "README.md").read_text(), re.M)
+    number = r"(Figure|Table) \w\.\d+"
+    assert [re.match(number, line)[0] for line in missing] == [
+        "Figure 3.1",
+        "Figure 3.5",
+        "Figure 4.6",
+    ]
+    assert ["CITYSCAPES=/path" in line for line in missing] == [True, True, False]
+    # what shows no data comes from git
+    table = (ROOT / "figures" / "table_3_2.md").read_text()
+    assert (run.published / "table_3_2.md").read_text() == table
+
+
+def test_a_long_table_is_linked(run):
+    style.save_table(pd.DataFrame({"row": range(11)}), run.figures, "few_keypoints", "a note")
+    gallery.update(run)
+    text = (run.published / "README.md").read_text()
+    assert "[11 rows](few_keypoints.md)" in text and "| 10 |" not in text
+    assert "| 01 | 12" in text
+
+
+def test_each_artefact_is_saved_by_a_notebook_and_has_files_in_git():
+    code = "".join(text for name in NOTEBOOKS for text in cells(name, "code").values())
+    named = set(re.findall(r'"(\w+)"', code))
+    names = {artefact["name"] for artefact in ARTEFACTS if artefact["kind"] != "text"}
+    assert names - named == set()
+    assert {name for name in named if re.match(r"(figure|table)_\w_\d", name)} <= names
+    assert [name for name in names if not list((ROOT / "figures").glob(f"{name}.*"))] == []
+
+
+@pytest.mark.parametrize("artefact", FIGURES, ids=lambda artefact: artefact["name"])
+def test_each_figure_has_words_that_say_what_is_to_be_seen(artefact):
+    seen = captions.SEEN[artefact["name"]]
+    assert len(seen.split()) > 6 and seen not in (artefact["title"], artefact["caption"])
+
+
+def test_the_gallery_in_git_is_made_from_what_is_in_git():
+    """After a change of a caption or a table: `make page`."""
+    in_git = read_settings({})
+    text = (ROOT / "figures" / "README.md").read_text()
+    assert text == gallery.text(in_git)
+    links = re.findall(r"\]\(([^)]+)\)", text)
+    missing = [link for link in links if not (ROOT / "figures" / link).is_file()]
+    assert len(links) > 60 and missing == []
+    assert gallery.REAL_CHAPTER in text  # two runs: real and rendered
+
+
+def test_numbers_of_the_run_stand_beside_the_thesiss(run):
+    files = {
+        "figure_4_01.csv": "epoch,val_loss\n1,0.8\n2,0.9\n",
+        "table_4_1.csv": "sequence,mean keypoints\n00,500\n01,300\n",
+        "timings/seconds.csv": (
+            "sequence,method,dilation_width,seconds\n00,baseline,,10\n00,masked,1,8\n00,masked,2,11\n"
+        ),
+    }
+    for name, text in files.items():
+        path = run.figures / name
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(text)
+    numbers = gallery.beside_the_thesis(run.figures)
+    assert (numbers["figure_4_01"]["epochs"], numbers["figure_4_01"]["best"]["epoch"]) == (2, 1)
+    assert list(numbers["figure_4_07"]["keypoints"]) == [500, 300]
+    assert list(numbers["figure_4_17"]["saved"]) == [20, -10]
