@@ -24,7 +24,7 @@ def _sizes(
 
 SIZES = {
     "smoke": _sizes(2, 12, 12, 4),
-    "lab": _sizes(3, 40, 60, 12),
+    "lab": _sizes(6, 25, 60, 12),
     # A street depends on its drive's length. With 24 frames, steps of drive 05 fail even with all
     # keypoints.
     "demo": _sizes(11, 25, 100, 20),

@@ -31,7 +31,7 @@ LONGEST = (
     "test_study.py",
     "test_own_sources.py",
     "test_runner.py",
-    "test_edits.py",
+    "test_exercises.py",
     "test_tools.py",
 )
 # fixtures that take seconds

@@ -211,10 +211,14 @@ def table_of_few(rows: pd.DataFrame, times: pd.DataFrame | None = None) -> pd.Da
 def figure_of_few(rows: pd.DataFrame) -> Figure:
     """Draw the ratios of both errors against the number of keypoints. rows: of `ratios_to_all`.
 
-    Ratios near 1 are drawn once more, enlarged; arrows there mark intervals that are cut.
+    If most ratios are near 1, they are drawn once more, enlarged; arrows there mark intervals that
+    are cut.
     """
-    scales = list(product(ERRORS, (False, True)))
-    drawing, panels = style.new_figure(len(scales), len(ESTIMATORS), sharex=True, height=9)
+    of_few = rows[rows["choice"] != "all"]
+    enlarged = (False, True) if of_few["ratio"].between(*NEAR).mean() > 0.5 else (False,)
+    scales = list(product(ERRORS, enlarged))
+    height = 1 + 2 * len(scales)
+    drawing, panels = style.new_figure(len(scales), len(ESTIMATORS), sharex=True, height=height)
     for (error, near), panel_row in zip(scales, panels, strict=True):
         for panel, estimator in zip(panel_row, ESTIMATORS, strict=True):
             shown = rows[(rows["error"] == error) & (rows["estimator"] == estimator)]

@@ -64,8 +64,8 @@ PROFILES = {
         repetitions=2,
         world=street_world.SIZES["smoke"],
     ),
-    # For a course: a notebook takes up to two minutes on two cores. Three short drives show how
-    # much of a difference is chance.
+    # For a course: a notebook takes up to two minutes on two cores. Six short drives are enough for
+    # an interval.
     "lab": Profile(
         image_size=128,
         base_filters=8,
@@ -76,7 +76,7 @@ PROFILES = {
         epochs=6,
         patience=5,
         training_images=60,
-        frames=40,
+        frames=25,
         timed_frames=5,
         widths=(1, 5, 10, 15),
         repetitions=2,
