@@ -305,15 +305,8 @@ def _detector(options: Any) -> Any:
 def _sequence(options: Any) -> Any:
     from thesis_repro.data.kitti import Sequence
 
-    sequence = Sequence(
-        options.kitti,
-        options.sequence,
-        options.camera,
-        getattr(options, "speed", None),
-        getattr(options, "fps", None),
-        getattr(options, "truth", None),
-        getattr(options, "calibration", None),
-    )
+    own = {name: vars(options).get(name) for name in ("speed", "fps", "truth", "calibration")}
+    sequence = Sequence(options.kitti, options.sequence, options.camera, **own)
     sequence = sequence.subset(options.frames)
     if vars(options).get("without_border"):
         return sequence.without_border()

@@ -93,7 +93,7 @@ SHARED: dict[str, dict[str, Any]] = {
     "--sequence": dict(
         required=True,
         metavar="NN",
-        help="00 to 21, or without --kitti a raw drive of KITTI or a folder with your own frames",
+        help="00 to 21, or without --kitti a folder: a raw drive of KITTI, EuRoC, TUM RGB-D, or your own frames",
     ),
     "--frames": dict(
         type=values.number_of_frames,
@@ -102,7 +102,7 @@ SHARED: dict[str, dict[str, Any]] = {
     ),
     "--camera": dict(
         metavar="image_N",
-        help="folder of the frames (image_0, or else image_2, read as gray; in a raw drive image_00, ...)",
+        help="folder of the frames (image_0, or else image_2, read as gray; in raw drives image_00, ...; in EuRoC cam0)",
     ),
     "--output": dict(
         type=path, dest="folder", required=True, metavar="DIR", help="folder for all results"

@@ -77,6 +77,7 @@ class Sequence:
         root: str | Path | None,
         name: str | int | Path,
         camera: str | None = None,
+        *,
         speed: float | None = None,
         fps: float | None = None,
         truth: str | Path | None = None,
