@@ -57,6 +57,7 @@ setup: .venv/ready $(if $(filter 1,$(GPU)),.venv/ready-gpu)
 	@$(PIP) $$(grep -o '^uv==[0-9.]*' environment.txt)
 	@$(call install,-r environment.txt)
 	@$(call install,--no-build-isolation -e .)
+	@echo "$(CURDIR)/notebooks" >"$$(echo .venv/lib/python3*/site-packages)/notebooks.pth"  # found from any folder
 	@mkdir -p .venv/share/jupyter/lab/settings && touch $@ && \
 	echo '{"@jupyterlab/apputils-extension:notification": {"fetchNews": "false"}}' >.venv/share/jupyter/lab/settings/overrides.json
 .venv/ready-gpu: environment-gpu.txt .venv/ready

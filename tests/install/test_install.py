@@ -96,6 +96,12 @@ def test_an_installed_package_runs_without_the_extras(
     assert files() == before
 
 
+@pytest.mark.torture
+def test_notebooks_find_their_modules_from_any_folder(tmp_path):
+    """As papermill executes them; `make setup` sees to it."""
+    succeed([sys.executable, "-c", "import thesis.settings"], tmp_path, PYTHONPATH=None)
+
+
 @pytest.mark.slow
 def test_a_type_checker_sees_the_types_of_the_main_names(tmp_path):
     lines = [
