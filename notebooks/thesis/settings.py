@@ -20,7 +20,8 @@ from thesis_repro.masks import WIDTHS
 from thesis_repro.running import program
 from thesis_repro.running.values import list_of_widths, number_of_frames, positive_whole_number
 
-ROOT = Path(__file__).resolve().parents[2]  # of the checkout
+# the checkout, also for a copy of this folder, as `make lab` makes
+ROOT = Path(street_world.__file__).resolve().parents[1]
 PREFIX = "THESIS_REPRO_"
 
 

@@ -1,3 +1,7 @@
+import shutil
+import subprocess
+import sys
+
 import pytest
 
 from thesis.settings import PROFILES, ROOT, read_settings
@@ -61,3 +65,19 @@ def test_folders_begin_at_home_or_in_the_checkout(monkeypatch, tmp_path):
     assert (at_home.kitti, at_home.build.parent) == (tmp_path / "kitti", tmp_path / "b")
     assert at_home.published.parent == tmp_path / "f"
     assert settings_of(BUILD="b").world == ROOT / "b/world-demo"
+
+
+def test_a_copy_for_the_lab_uses_the_results_of_the_checkout(tmp_path):
+    copied = ROOT / "notebooks/thesis", tmp_path / "thesis"
+    shutil.copytree(*copied, ignore=shutil.ignore_patterns("__pycache__"))
+    code = "import thesis.settings as s; print(s.__file__, s.read_settings({}).build)"
+    run = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=tmp_path,
+        env={"PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    used, build = run.stdout.split()
+    assert used.startswith(str(tmp_path)) and build == str(ROOT / "build/embedded-demo")
