@@ -102,7 +102,7 @@ SHARED: dict[str, dict[str, Any]] = {
     ),
     "--camera": dict(
         metavar="image_N",
-        help="folder of the frames (image_0, or else image_2, read as gray; in raw drives image_00, ...; in EuRoC cam0)",
+        help="folder of the frames (image_0, or else image_2, read as gray; in raw drives image_00; in EuRoC cam0)",
     ),
     "--output": dict(
         type=path, dest="folder", required=True, metavar="DIR", help="folder for all results"
