@@ -4,6 +4,7 @@ A sequence is sequences/NN with image_0, calib.txt and times.txt; its poses are 
 frames lie in image_0 or in the folder itself, and poses.txt beside them.
 """
 
+import re
 from functools import partial
 from pathlib import Path
 
@@ -19,6 +20,8 @@ from thesis_repro.running.files import images
 LAYOUT = "KITTI odometry (image_0, calib.txt), or frames in the folder itself"
 # left gray, left colour, then the right ones
 IMAGE_FOLDERS = ("image_0", "image_2", "image_1", "image_3")
+KEYS = {name: f"P{name[-1]}" for name in IMAGE_FOLDERS}  # their lines in the calibration
+RIGHT = re.compile("P(_rect_0)?[13]")  # lines of the right cameras
 
 
 def is_mine(folder: Path) -> bool:
@@ -38,19 +41,15 @@ def poses(folder: Path) -> Path:
 def files(folder: Path, camera: str | None) -> Files:
     """Files of a sequence. camera: one of IMAGE_FOLDERS."""
     image_folder = camera_folder(folder, IMAGE_FOLDERS, camera) or folder
-    key, calibration = "P0", folder / "calib.txt"
-    if image_folder != folder:
-        key = f"P{image_folder.name[-1]}"
-    found = Files(
+    calibration, key = folder / "calib.txt", KEYS.get(image_folder.name, "P0")
+    return Files(
         frames_in(image_folder),
         calibration,
         partial(read_camera, key=key),
         folder / "times.txt",
         poses(folder),
+        read_poses=partial(_read_poses, calibration=calibration, key=key),
     )
-    if key in ("P1", "P3"):
-        found = found._replace(read_poses=partial(read_moved, calibration=calibration, key=key))
-    return found
 
 
 def read_camera(path: Path, key: str = "P0") -> Camera:
@@ -70,18 +69,19 @@ def _projection(path: Path, key: str) -> np.ndarray:
     return projection
 
 
-def read_moved(path: Path, times: np.ndarray, calibration: Path, key: str) -> tuple:
-    """Read poses of camera 0, as `read_truth` does, and move them to a right camera.
+def _read_poses(path: Path, times: np.ndarray, calibration: Path, key: str) -> tuple:
+    indices, found = read_truth(path, times)
+    return indices, moved(found, calibration, key)
+
+
+def moved(poses: np.ndarray, calibration: Path, key: str) -> np.ndarray:
+    """Poses of camera 0, moved to a right camera.
 
     It sees a point X of camera 0 at K X + p, so its centre is -K^-1 p, half a metre to the right.
     (The left colour camera, 6 cm beside, has the poses of camera 0.)
     """
-    indices, moved = read_truth(path, times)
-    return indices, moved @ to_camera(calibration, key)
-
-
-def to_camera(calibration: Path, key: str) -> np.ndarray:
-    """Pose, 4x4, of a camera in the axes of camera 0."""
+    if not RIGHT.fullmatch(key):
+        return poses
     projection, offset = _projection(calibration, key), np.eye(4)
     offset[:3, 3] = -np.linalg.solve(projection[:, :3], projection[:, 3])
-    return offset
+    return poses @ offset

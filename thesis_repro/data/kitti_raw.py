@@ -80,12 +80,9 @@ def _doubts(folder: Path) -> list[str]:
 
 
 def _read_truth(path: Path, times: np.ndarray, key: str) -> tuple:
-    """Read the poses of all frames; for a right camera, as `kitti_odometry.read_moved` does."""
+    """Read the poses of all frames, as `trajectories.read_truth` does."""
     folder = path.parent.parent
-    moved = read_poses(folder)
-    if key in ("P_rect_01", "P_rect_03"):
-        moved = moved @ kitti_odometry.to_camera(calibration(folder), key)
-    return None, moved
+    return None, kitti_odometry.moved(read_poses(folder), calibration(folder), key)
 
 
 def read_times(path: str | Path) -> np.ndarray:
