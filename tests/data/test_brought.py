@@ -372,7 +372,7 @@ def test_distortion_is_taken_out_as_opencv_does(own, name, text):
     [
         ("camera.txt", "50 50 32 24 0.1"),
         ("camera.txt", "P0: 50 0 32"),
-        ("camera.yaml", "a: [1"),
+        *(("camera.yaml", text) for text in ("a: [1", "", "- 1", "K: {a: 1}", "T_BS: [1]", "\t")),
         ("camera.yaml", OPENCV.replace(".1, 0.01, -0.02 ]", ".1 ]")),
         ("camera.yaml", KALIBR.replace("intrinsics", "extrinsics")),
         ("camera.yaml", KALIBR.replace("32, 24", "32")),

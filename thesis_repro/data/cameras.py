@@ -77,7 +77,7 @@ def _stated(text: str) -> dict[str, Any]:
     # OpenCV begins with a directive and marks matrices in ways that YAML does not know
     lines = [line for line in text.splitlines() if not line.startswith("%")]
     documents = yaml.safe_load_all("\n".join(lines).replace("!!opencv-matrix", ""))
-    stated = next(document for document in documents if document)
+    stated: dict[str, Any] = next(filter(None, documents), {})
     return stated.get("cam0", stated)
 
 
