@@ -5,7 +5,7 @@ The steps follow Nister (2004), An efficient solution to the five-point relative
 
 1. `null_space`: five epipolar constraints leave E = x X + y Y + z Z + W with unknown x, y, z;
 2. `constraints`: the trace constraint and the determinant constraint on E are ten cubic equations
-in x, y, z;
+   in x, y, z;
 3. `eliminate`: Gauss-Jordan elimination leaves three equations B(z) (x, y, 1)^T = 0;
 4. `determinant`: det B(z) is a polynomial of degree ten in z;
 5. `real_roots.real_roots`: the real roots of det B(z) = 0 (a complex root gives no motion);

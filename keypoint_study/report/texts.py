@@ -1,4 +1,4 @@
-"""Texts made from templates (templates/*.j2), and numbers and names as texts."""
+"""Texts made from the folder templates, and numbers and names as texts."""
 
 import os
 import re
