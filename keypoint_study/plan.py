@@ -1,7 +1,9 @@
 """A study with your own masks: its settings, the check of its input, and its runs."""
 
+from collections.abc import Container
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -122,7 +124,13 @@ class Study:
                 done = {job: run for job, run in runs.items() if job not in first.reasons}
                 outcome = run_all(done | runs_of(as_many)).after(first)
         table = outcome.table[~outcome.table["sequence"].isin(foreign)]
-        return replace(outcome, table=table, warnings=[*outcome.warnings, *foreign.values()])
+        warnings = [
+            *outcome.warnings,
+            *foreign.values(),
+            *self._foreign_paths(foreign),
+            *runner.number_warnings(table, self.sources),
+        ]
+        return replace(outcome, table=table, warnings=warnings)
 
     def _foreign_truths(self, table: pd.DataFrame, folder: Path) -> dict[str, str]:
         """Return a line for each sequence whose true poses are not the camera's, and print it.
@@ -146,6 +154,18 @@ class Study:
         lines = {name: f"{line}; sequence {name} is left out" for name, line in lines.items()}
         for line in lines.values():
             program.log.warning(line)
+        return lines
+
+    def _foreign_paths(self, left_out: Container[str]) -> list[str]:
+        """Return a line for each path of another convention than the camera's, and print it."""
+        lines = []
+        for source, sequence in product(self.sources, self.opened):
+            if source.kind == "paths" and sequence.name not in left_out:
+                file = source.file(sequence.name)
+                poses = sources.read_path(file, sequence)
+                if reason := metrics.foreign_poses(poses, sequence.poses):
+                    lines.append(f"{file}: {reason}")
+                    program.log.warning(lines[-1])
         return lines
 
     def worths(

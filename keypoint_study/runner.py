@@ -20,6 +20,7 @@ import pandas as pd
 from keypoint_study import comparisons
 from keypoint_study.controls import min_distance
 from keypoint_study.jobs import Job, Run, repeated
+from keypoint_study.methods import METHODS
 from keypoint_study.path_errors import path_errors
 from keypoint_study.sources import Source
 from thesis_repro import odometry
@@ -36,6 +37,7 @@ from thesis_repro.running.workers import open_pool
 
 # tables whose entries a run may use: its record has the code of those that it used
 TABLES = ("thesis_repro.data.layout.LAYOUTS",)
+AS_MANY = 1.1  # controls keep as many keypoints if the ratio is within 1 / AS_MANY to this
 SETTINGS = "settings.json"  # of the runs in a folder
 # Passes for each of several workers. Every pass decodes and tracks anew: a sequence on two workers
 # takes 13 % more CPU time than in one pass, and with 4 pieces 35 %.
@@ -327,6 +329,41 @@ def _report(reasons: Mapping[Job, str]) -> list[str]:
     return lines
 
 
+def kept_keypoints(runs: pd.DataFrame, source: Source) -> pd.Series:
+    """Return the mean number of keypoints that a source keeps, or its masks of the tested width.
+
+    By sequence; empty for paths.
+    """
+    of_source = comparisons.of_source(runs, source.name)
+    if source.kind == "keypoints":
+        own = of_source[of_source["method"] == "keypoints"]
+        return own.groupby("sequence")["mean_keypoints"].mean()
+    return comparisons.keypoints_left(of_source)
+
+
+def number_warnings(runs: pd.DataFrame, sources: Iterable[Source]) -> list[str]:
+    """Return a line for each control that keeps not as many keypoints as its source, as it should.
+
+    The line names the sequence that differs most.
+    """
+    lines = []
+    for source in sources:
+        wanted = kept_keypoints(runs, source)
+        of_source = runs[runs["source"] == source.name]
+        for name in [name for name, method in METHODS.items() if method.as_many]:
+            rows = of_source[of_source["method"] == name]
+            ratios = rows.groupby("sequence")["mean_keypoints"].mean() / wanted
+            off = np.log(ratios.dropna()).abs()
+            if (off > np.log(AS_MANY)).any():
+                worst = off.idxmax()
+                lines.append(
+                    f"sequence {worst} {source.name}: the control {METHODS[name].title} keeps "
+                    f"{ratios[worst]:.2f} times as many keypoints, which may explain a difference"
+                )
+                program.log.warning(lines[-1])
+    return lines
+
+
 def keypoint_controls(
     runs: pd.DataFrame,
     sequences: Iterable[Sequence],
@@ -335,14 +372,14 @@ def keypoint_controls(
     width: int,
     estimators: Iterable[str] = COMPARED,
 ) -> list[Job]:
-    """Return jobs without a mask that keep as many keypoints as the masks of each source leave.
+    """Return jobs without a mask that keep as many keypoints as each source.
 
     "fewer" keeps the strongest keypoints; "spread" keeps keypoints farther apart. runs: with the
     masks. width: pixels, of the masks from label maps that leave as many keypoints.
     """
     jobs: list[Job] = []
     for source in sources:
-        keypoints = comparisons.keypoints_left(comparisons.of_source(runs, source.name))
+        keypoints = kept_keypoints(runs, source)
         width_of_source = width if source.has_width else None
         for sequence in sequences:
             if sequence.name not in keypoints:  # its runs with masks failed

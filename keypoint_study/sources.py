@@ -14,7 +14,7 @@ import pandas as pd
 from thesis_repro import odometry
 from thesis_repro.data import label_ids
 from thesis_repro.data.kitti import Sequence
-from thesis_repro.data.trajectories import have_times, read_poses, read_poses_at
+from thesis_repro.data.trajectories import read_truth
 from thesis_repro.errors import InputError, cause
 from thesis_repro.masks import MaskSettings
 from thesis_repro.masks.folders import LabelMasks, MaskFolder, folder_of_sequence, read_mask
@@ -110,10 +110,20 @@ class Source:
 def own_calls(path: Path) -> odometry.Calls:
     """Return the odometry's calls with the functions that a Python file defines in their places.
 
-    Raises InputError if it defines none of them, and what its code raises. What its `detect` and
-    `track` return is checked in every frame.
+    Raises InputError for another file, if its code fails, and if it defines none of them. What its
+    `detect` and `track` return is checked in every frame.
     """
-    defined = runpy.run_path(str(path))
+    if path.suffix != ".py" or path.is_dir():
+        raise InputError(
+            f"{path}: must be a Python file (.py) with a function detect, track or another of the odometry's "
+            "calls; detect may read features that are in files, frame by frame"
+        )
+    try:
+        defined = runpy.run_path(str(path))
+    except OSError:
+        raise
+    except Exception as error:  # of code that a person wrote
+        raise InputError(f"{path}: {cause(error)}") from error
     own = {name: defined[name] for name in odometry.Calls._fields if name in defined}
     if not own:
         raise InputError(f"{path}: must define a function {' or '.join(odometry.Calls._fields)}")
@@ -171,17 +181,26 @@ def _try(path: Path, sequence: Sequence) -> None:
 def own_path(path: Path, sequence: Sequence) -> np.ndarray:
     """Return the path of another system, (n, 4, 4), metres, moved to where the odometry starts.
 
-    The file has poses with times, or one for each frame; those after the sequence's last frame are
-    left out. Raises InputError if a frame has no pose.
+    See `read_path`.
     """
-    if have_times(path):
-        _, poses = read_poses_at(path, sequence.times)
-    else:
-        poses = read_poses(path)
-    # a study may use only the first frames
-    if len(poses) not in (len(sequence), len(images(sequence.frame_paths[0].parent))):
+    poses = read_path(path, sequence)
+    return odometry.start_pose(sequence) @ np.linalg.inv(poses[0]) @ poses
+
+
+def read_path(path: Path, sequence: Sequence) -> np.ndarray:
+    """Return the poses of a file at the frames of a sequence, (n, 4, 4).
+
+    The file has poses with times, or one for each frame: of the sequence or, because it may be only
+    a part of them, of its folder. Raises InputError if a frame has no pose.
+    """
+    _, poses = read_truth(path, sequence.times)
+    frames = images(sequence.frame_paths[0].parent)
+    if len(poses) == len(frames):
+        place = {frame: index for index, frame in enumerate(frames)}
+        poses = poses[[place[frame] for frame in sequence.frame_paths]]
+    if len(poses) != len(sequence):
         raise InputError(f"{path}: {len(poses)} poses for {len(sequence)} frames; each needs one")
-    return odometry.start_pose(sequence) @ np.linalg.inv(poses[0]) @ poses[: len(sequence)]
+    return poses
 
 
 def by_name(sources: Path | Iterable[Source]) -> dict[str, Source]:

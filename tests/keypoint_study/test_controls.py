@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from keypoint_study import comparisons, controls, methods, runner
+from keypoint_study import comparisons, controls, jobs, methods, runner, worth
 from keypoint_study.jobs import first_jobs, runs_of
 from keypoint_study.sources import Source
 from thesis import ablations, section_4_2
@@ -66,6 +66,43 @@ def test_controls_use_the_frame_and_settings_of_their_name(
     ):
         expected = masks.keypoint_mask(label_map, sequence.size, WIDTH, settings)
         assert np.array_equal(made[method][5], expected), method
+
+
+@pytest.mark.parametrize(
+    "name",
+    [name for name in methods.MASK_CONTROLS if methods.METHODS[name].group == methods.CONTROL],
+)
+def test_a_control_keeps_as_many_pixels_as_the_masks(made, name):
+    """A new entry of the table is here, too; one that is drawn inside out fails."""
+    shares, expected = (
+        np.mean([masks.coverage(made[method][index]) for index in range(12)])
+        for method in (name, "masked")
+    )
+    assert shares == pytest.approx(expected, abs=0.01)
+
+
+def orb_on_masks(sequence, source, width):
+    return replace(THESIS, detector=keypoints.orb), source.masks(sequence, width)
+
+
+def test_a_methods_own_settings_win_and_nothing_joins_a_study_unasked(
+    sequence, small_labels, monkeypatch
+):
+    own = methods.Method("ORB on masks", methods.CONTROL, orb_on_masks, every_study=False)
+    monkeypatch.setitem(methods.METHODS, "orb-on-masks", own)
+    monkeypatch.setattr(jobs, "MASK_CONTROLS", [*methods.MASK_CONTROLS, "orb-on-masks"])
+    source, few = Source(small_labels), {"detector": keypoints.spread(200)}
+    for named in ((), ("orb-on-masks",)):
+        planned = first_jobs([sequence], {"thesis": (WIDTH,)}, tested=WIDTH, named=named)
+        runs = runs_of(planned, [sequence], [source], {"scale_gate": 0.5}, few)
+        settings = {job.method: run.settings for job, run in runs.items()}
+        assert set(named) == {"orb-on-masks"} & set(settings)
+        chosen, _ = worth.choices_of(sequence, [source], WIDTH, 400, True, few, named)
+        assert set(named) == {"orb-on-masks"} if ("ORB on masks", 400) in chosen else not named
+    assert settings["masked"].detector == keypoints.spread(200)
+    assert settings["orb-on-masks"] == replace(THESIS, detector=keypoints.orb, scale_gate=0.5)
+    assert chosen["ORB on masks", 400][0].detector is keypoints.orb
+    assert chosen["mirrored mask", 400][0].detector == keypoints.spread(200)
 
 
 def test_random_lines_and_image_edges_cover_as_much_as_the_mask(sequence, made):

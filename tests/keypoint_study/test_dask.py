@@ -1,9 +1,12 @@
 """Runs on a real Dask cluster on this machine: a scheduler and two workers, each a process."""
 
 import os
+import signal
 import subprocess
 import sys
 import threading
+import time
+from contextlib import contextmanager
 
 import pandas as pd
 import pytest
@@ -27,19 +30,25 @@ def start(folder, *arguments):
         return subprocess.Popen(command, cwd=folder, stdout=log, stderr=log, env=environment)
 
 
-@pytest.fixture(scope="module")
-def scheduler(tmp_path_factory):
-    """Address of a scheduler; it has no workers but those of `two_workers`."""
-    folder = tmp_path_factory.mktemp("scheduler")
+@contextmanager
+def started_scheduler(folder):
+    """(its process, its address) of a scheduler."""
     file = folder / "scheduler.json"
     places = ("--port", "0", "--dashboard-address", "127.0.0.1:0", "--scheduler-file", file)
     process = start(folder, "scheduler", *places)
     try:
         wait_for(lambda: file.is_file() and file.read_text().strip().endswith("}"))
-        yield pd.read_json(file, typ="series")["address"]
+        yield process, pd.read_json(file, typ="series")["address"]
     finally:
         process.kill()
         process.wait()
+
+
+@pytest.fixture(scope="module")
+def scheduler(tmp_path_factory):
+    """Address of a scheduler; it has no workers but those of `two_workers`."""
+    with started_scheduler(tmp_path_factory.mktemp("scheduler")) as (_, address):
+        yield address
 
 
 @pytest.fixture
@@ -85,3 +94,26 @@ def test_a_cluster_gives_the_same_bits_although_a_worker_is_killed(
     result = runner.run_all(runs, there, scheduler=scheduler)
     killer.join()
     pd.testing.assert_frame_equal(result.table, here.table, check_exact=True)
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+def test_a_scheduler_that_ends_or_hangs_is_named(tmp_path, monkeypatch, capfd, number):
+    monkeypatch.setattr(workers, "TIMEOUT", 3)
+    with started_scheduler(tmp_path) as (process, address):
+        options = ("--no-nanny", "--nthreads", 1, "--local-directory", tmp_path / "scratch")
+        worker = start(tmp_path, "worker", address, *options)
+        try:
+            from dask.distributed import Client
+
+            with Client(address, set_as_default=False) as client:
+                client.wait_for_workers(1, timeout=120)
+            with (
+                pytest.raises(InputError, match=f"{address}: no longer answers"),
+                workers.open_pool(1, address) as pool,
+            ):
+                threading.Timer(2, process.send_signal, [number]).start()
+                list(pool.run(time.sleep, [(60,)]))
+        finally:
+            worker.kill()
+            worker.wait()
+    assert "Traceback" not in capfd.readouterr().err

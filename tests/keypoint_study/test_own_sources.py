@@ -15,12 +15,13 @@ from keypoint_study.sources import Source
 from thesis_repro import odometry
 from thesis_repro.command.cli import main
 from thesis_repro.data.kitti import Sequence
-from thesis_repro.data.trajectories import write_kitti_poses
+from thesis_repro.data.trajectories import write_kitti_poses, write_tum
 from thesis_repro.errors import InputError
 from thesis_repro.odometry import metrics
 from thesis_repro.odometry.loop import VoteOfAll
 
 pytestmark = pytest.mark.slow
+T = np.arange(12) / 10  # times of the frames
 
 
 @pytest.fixture
@@ -156,6 +157,68 @@ def test_own_keypoints_are_drawn(street, capsys):
     failed = runs[runs["source"] != "own"]
     assert report._failed(planned, failed)["source"].tolist() == ["own"]
     assert report._failed(planned, runs).empty
+
+
+@pytest.mark.parametrize(
+    "name, content, said",
+    [
+        ("features.h5", b"\x89HDF\r\n\x1a\n" + bytes(99), "must be a Python file"),
+        ("net.pt", b"PK\x03\x04" + bytes(99), "must be a Python file"),
+        ("folder.py", None, "must be a Python file"),
+        ("wrong.py", b"def detect(frame, settings, mask)\n    return None\n", "SyntaxError"),
+        ("data.py", b"\x89HDF\r\n" + bytes(99), "SyntaxError"),
+        ("other.py", b"import not_installed_here\n", "No module named 'not_installed_here'"),
+    ],
+)
+def test_what_is_no_python_file_is_one_line(street, capsys, name, content, said):
+    path = street.parent / name
+    path.mkdir() if content is None else path.write_bytes(content)
+    code, out = study(street, "--keypoints", path)
+    *_, line = capsys.readouterr().err.splitlines()
+    assert code == 1 and not out.exists() and line.startswith("error: ")
+    assert f"{name}: " in line and said in line
+
+
+def test_own_keypoints_have_controls_of_equal_number_and_their_flags_are_told(street, capsys):
+    path = street.parent / "own.py"
+    path.write_text(DETECT.format(f"{CORNERS}[:5]"))  # too few
+    code, out = study(street, "--keypoints", f"own={path}", "--controls", "--frames", 6)
+    assert code == 0 and "sequence 00 own: " in capsys.readouterr().err
+    runs = pd.read_csv(out / "runs.csv", dtype={"sequence": str}).set_index("method")
+    number = runs.groupby("method")["mean_keypoints"].mean()
+    assert set(runs.index) == {"baseline", "keypoints", "fewer", "spread"}
+    assert number["fewer"] == pytest.approx(number["keypoints"], abs=1)
+
+
+def test_one_sequence_that_stands_removes_no_other_worth(street, capsys):
+    write_kitti_poses(street / "poses/01.txt", np.tile(np.eye(4), (12, 1, 1)))
+    code, out = study(street, "--masks", street.parent / "masks", "--frames", 6)
+    assert code == 0 and "sequences/01: no step of" in capsys.readouterr().err
+    assert set(pd.read_csv(out / "worth_runs.csv", dtype=str)["sequence"]) == {"00"}
+
+
+@pytest.mark.parametrize("form", [write_kitti_poses, lambda path, poses: write_tum(path, poses, T)])
+def test_a_path_is_taken_at_the_frames_that_have_a_truth(street, tmp_path, form):
+    poses = Street(12).poses
+    write_tum(street / "poses/00.txt", poses[5:], T[5:])  # the truth begins late
+    (street / "sequences/00/times.txt").write_text("".join(f"{time}\n" for time in T))
+    form(tmp_path / "path.txt", poses)
+    sequence = Sequence(street, "00")
+    for part in (sequence, sequence.subset(4)):
+        assert np.allclose(sources.own_path(tmp_path / "path.txt", part), part.poses, atol=1e-8)
+
+
+def test_a_path_with_other_axes_is_told(street, capsys):
+    flip = np.diag([1.0, -1, -1, 1])
+    poses = Street(12).poses
+    for name, path in (("opengl", flip @ poses @ flip), ("right", poses)):
+        for sequence in ("00", "01"):
+            write_kitti_poses(street.parent / name / f"{sequence}.txt", path)
+    paths = [word for name in ("opengl", "right") for word in ("--paths", street.parent / name)]
+    code, out = study(street, *paths)
+    error = capsys.readouterr().err
+    assert code == 0 and error.count("opengl/0") == 2 and "OpenGL" in error
+    assert "right/0" not in error and "OpenGL" in (out / "index.html").read_text()
 
 
 BREAKING = """

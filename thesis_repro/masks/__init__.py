@@ -20,8 +20,8 @@ from thesis_repro.masks.kinds import (
     edges,
     exact_edges,
     keypoint_mask,
+    near_movable,
 )
-from thesis_repro.masks.memory import forget
 
 __all__ = [
     "BOUNDARIES",
@@ -39,7 +39,7 @@ __all__ = [
     "dilate",
     "edges",
     "exact_edges",
-    "forget",
     "keypoint_mask",
+    "near_movable",
     "thesis_mask",
 ]

@@ -12,7 +12,15 @@ import numpy as np
 from thesis_repro.data import label_ids
 from thesis_repro.data.kitti import Sequence, check_size
 from thesis_repro.errors import InputError
-from thesis_repro.masks import THESIS_MASKS, MaskSettings, check_width, forget, keypoint_mask
+from thesis_repro.masks import (
+    THESIS_MASKS,
+    MaskSettings,
+    canny_edges,
+    check_width,
+    edges,
+    keypoint_mask,
+    near_movable,
+)
 from thesis_repro.running import provenance
 from thesis_repro.running.code_used import digest_of_code
 from thesis_repro.running.files import listed, progress, read_gray, write_png
@@ -37,7 +45,7 @@ class LabelMasks:
         dilation_width: int | None,
         settings: MaskSettings = THESIS_MASKS,
     ) -> None:
-        self.paths = _paths_by_frame(folder, sequence, "label map")
+        self.paths = _label_map_paths(folder, sequence)
         self.frame_paths = sequence.frame_paths
         self.size = sequence.size
         self.dilation_width = dilation_width
@@ -79,7 +87,8 @@ def _read_once(path: Path, ids: str, changed: int, size: int) -> np.ndarray:
 
 def forget_edges() -> None:
     """Clear what LabelMasks keeps, so that the time to make a mask can be measured."""
-    forget()
+    for function in (canny_edges, edges, near_movable):
+        function.forget()
     _read_once.cache_clear()
 
 
@@ -116,7 +125,7 @@ class MaskFolder:
     """
 
     def __init__(self, folder: str | Path, sequence: Sequence, invert: bool = False) -> None:
-        self.paths = _paths_by_frame(folder, sequence, "mask")
+        self.paths = _mask_paths(folder, sequence)
         self.size = sequence.size
         self.invert = invert
 
@@ -191,10 +200,30 @@ def folder_of_sequence(folder: str | Path, sequence: str) -> Path:
     return subfolder
 
 
-def _paths_by_frame(folder: str | Path, sequence: Sequence, kind: str) -> list[Path]:
-    """One path a frame to its mask or label map. Raises InputError if one is missing."""
-    if kind == "mask" and Path(folder).is_file():
+def _label_map_paths(folder: str | Path, sequence: Sequence) -> list[Path]:
+    """One path a frame to its label map. Raises InputError if one is missing."""
+    place = _existing_folder(folder, sequence, "label map")
+    return _by_frame(place, {path.name: path for path in listed(place)}, sequence, "label map")
+
+
+def _mask_paths(folder: str | Path, sequence: Sequence) -> list[Path]:
+    """One path a frame to its mask. Raises InputError if one is missing."""
+    if Path(folder).is_file():
         return [Path(folder)] * len(sequence)
+    _check_format(Path(folder))
+    place = _existing_folder(folder, sequence, "mask")
+    present = _images_by_name(place)
+    if len(present) == 1:
+        single = next(iter(present.values()))
+        # a single mask with the name of a frame, also outside of a subset, is that frame's
+        frames = listed(sequence.frame_paths[0].parent, "*")
+        if single.stem not in {name for path in frames for name in (path.stem, path.name)}:
+            return [single] * len(sequence)
+    return _by_frame(place, present, sequence, "mask")
+
+
+def _existing_folder(folder: str | Path, sequence: Sequence, kind: str) -> Path:
+    """Folder of a sequence's files of a kind. Raises InputError if there is none that fits."""
     if not hasattr(sequence, "frame_paths"):
         raise InputError(
             f"{folder}: the frames are not in files, so no {kind} belongs to them; give masks as a "
@@ -205,23 +234,17 @@ def _paths_by_frame(folder: str | Path, sequence: Sequence, kind: str) -> list[P
             f"{folder}: {kind}s of raw frames do not fit frames without distortion; undistort the frames "
             "before their label maps are made, and leave out --calibration"
         )
-    if kind == "mask":
-        _check_format(Path(folder))
-    folder = folder_of_sequence(folder, sequence.name)
-    if not folder.is_dir():
+    place = folder_of_sequence(folder, sequence.name)
+    if not place.is_dir():
         raise InputError(
-            f"{folder}: no such folder; it must hold one {kind} for each frame of sequence "
+            f"{place}: no such folder; it must hold one {kind} for each frame of sequence "
             f"{sequence.name}"
         )
-    present = {path.name: path for path in listed(folder)}
-    if kind == "mask":
-        present = _images_by_name(folder)
-    if kind == "mask" and len(present) == 1:
-        single = next(iter(present.values()))
-        # a single mask with the name of a frame, also outside of a subset, is that frame's
-        frames = listed(sequence.frame_paths[0].parent, "*")
-        if single.stem not in {name for path in frames for name in (path.stem, path.name)}:
-            return [single] * len(sequence)
+    return place
+
+
+def _by_frame(folder: Path, present: dict[str, Path], sequence: Sequence, kind: str) -> list[Path]:
+    """One path a frame, of those that are present, by name. Raises InputError if one is missing."""
     # some tools append .png to the whole name
     appended = {f"{frame.name}.png": f"{frame.stem}.png" for frame in sequence.frame_paths}
     present = {appended.get(name, name): path for name, path in present.items()}

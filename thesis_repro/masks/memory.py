@@ -6,13 +6,12 @@ from typing import Any
 
 import numpy as np
 
-_caches: list[Any] = []
 
-
-def remembered(function: Callable) -> Callable:
+def remembered(function: Callable) -> Any:
     """Let a function of a label map remember its last results, arrays that nobody changes.
 
-    They are found by the label map's bytes, so a changed label map has none.
+    They are found by the label map's bytes, so a changed label map has none. Its `forget()` clears
+    them.
     """
 
     @lru_cache(maxsize=8)
@@ -25,11 +24,5 @@ def remembered(function: Callable) -> Callable:
     def from_map(label_map: np.ndarray, *arguments: Any) -> Any:
         return from_bytes(label_map.tobytes(), label_map.shape, *arguments)
 
-    _caches.append(from_bytes)
+    from_map.forget = from_bytes.cache_clear  # type: ignore[attr-defined]
     return from_map
-
-
-def forget() -> None:
-    """Clear what is remembered, so that the time to make a mask can be measured."""
-    for cache in _caches:
-        cache.cache_clear()

@@ -158,7 +158,9 @@ def _defined(node: ast.AST) -> list[str]:
         return []
     stored = []
     if isinstance(node, ast.Assign | ast.AnnAssign | ast.AugAssign):
-        names = [part for part in ast.walk(node) if isinstance(part, ast.Name)]
+        targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+        parts = [part for target in targets for part in ast.walk(target)]
+        names = [part for part in parts if isinstance(part, ast.Name)]
         stored = [part.id for part in names if isinstance(part.ctx, ast.Store)]
     return stored or [""]
 

@@ -6,11 +6,13 @@ whose workers died.)
 
 import logging
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import BrokenExecutor, CancelledError, Executor
+from concurrent.futures import BrokenExecutor, CancelledError, Executor, wait
 from contextlib import contextmanager
+from threading import RLock
 from typing import Any, NamedTuple
 
 from joblib.externals.loky import ProcessPoolExecutor
+from tqdm import tqdm
 
 from thesis_repro.errors import InputError
 from thesis_repro.running import program
@@ -22,10 +24,14 @@ LOST = "a worker process was lost; finished results are kept; repeat the command
 
 
 class Pool(NamedTuple):
-    """Workers. size: number of calls that run at the same time. executor: None for this process."""
+    """Workers. size: number of calls that run at the same time. executor: None for this process.
+
+    check: raises InputError if the workers can no longer be reached; called every TIMEOUT seconds.
+    """
 
     size: int
     executor: Executor | None = None
+    check: Callable | None = None
 
     def run(self, function: Callable, calls: Iterable[tuple]) -> Iterator[Any]:
         """Yield the results of calls, which are tuples of arguments, in their order."""
@@ -38,6 +44,10 @@ class Pool(NamedTuple):
             futures = [self.executor.submit(function, *call) for call in calls]
         for future in futures:
             program.check_stop()
+            while self.check:
+                if wait([future], TIMEOUT).done:
+                    break
+                self.check()
             yield future.result()
 
 
@@ -45,6 +55,7 @@ def _begin() -> None:
     """Prepare a worker process."""
     program.leave_ctrl_c_to_parent()
     program.keep_freed_memory()
+    tqdm.set_lock(RLock())  # its own is a semaphore of the system, which an ended worker leaves
 
 
 @contextmanager
@@ -84,7 +95,18 @@ def open_pool(processes: int, scheduler: str | None = None) -> Iterator[Pool]:
                 f"Dask scheduler {scheduler}: has no workers; start some with "
                 f"'dask worker {scheduler} --nthreads 1'"
             )
+
+        def check() -> None:
+            try:
+                client.sync(client.scheduler.identity, callback_timeout=TIMEOUT)
+            except (OSError, TimeoutError):
+                raise InputError(
+                    f"Dask scheduler {scheduler}: no longer answers; finished results are kept; start it "
+                    "again, with workers, and repeat the command"
+                ) from None
+
         try:
-            yield Pool(size, client.get_executor(pure=False))
+            yield Pool(size, client.get_executor(pure=False), check)
         except (KilledWorker, CancelledError):
+            check()
             raise InputError(LOST) from None
