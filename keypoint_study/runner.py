@@ -329,18 +329,6 @@ def _report(reasons: Mapping[Job, str]) -> list[str]:
     return lines
 
 
-def kept_keypoints(runs: pd.DataFrame, source: Source) -> pd.Series:
-    """Return the mean number of keypoints that a source keeps, or its masks of the tested width.
-
-    By sequence; empty for paths.
-    """
-    of_source = comparisons.of_source(runs, source.name)
-    if source.kind == "keypoints":
-        own = of_source[of_source["method"] == "keypoints"]
-        return own.groupby("sequence")["mean_keypoints"].mean()
-    return comparisons.keypoints_left(of_source)
-
-
 def number_warnings(runs: pd.DataFrame, sources: Iterable[Source]) -> list[str]:
     """Return a line for each control that keeps not as many keypoints as its source, as it should.
 
@@ -348,7 +336,7 @@ def number_warnings(runs: pd.DataFrame, sources: Iterable[Source]) -> list[str]:
     """
     lines = []
     for source in sources:
-        wanted = kept_keypoints(runs, source)
+        wanted = comparisons.keypoints_left(comparisons.of_source(runs, source.name))
         of_source = runs[runs["source"] == source.name]
         for name in [name for name, method in METHODS.items() if method.as_many]:
             rows = of_source[of_source["method"] == name]
@@ -379,7 +367,7 @@ def keypoint_controls(
     """
     jobs: list[Job] = []
     for source in sources:
-        keypoints = kept_keypoints(runs, source)
+        keypoints = comparisons.keypoints_left(comparisons.of_source(runs, source.name))
         width_of_source = width if source.has_width else None
         for sequence in sequences:
             if sequence.name not in keypoints:  # its runs with masks failed

@@ -134,32 +134,25 @@ def _draw_ratios(
     """Draw the ratios of one estimator and metric, each at the place of its label in `order`."""
     style.ratio_axis(panel.xaxis, [1 / reach, reach])
     dot: dict[str, Any] = {"color": "#555555", "markersize": 4, "markeredgewidth": 0}
+    edges = {1 / reach: ("<", "left"), reach: (">", "right")}
     for _, row in rows.iterrows():
         y = order.index(row["label"])
-        color = BASELINE
-        if row["method"] == "masked":
-            color = MASKED
+        color = MASKED if row["method"] == "masked" else BASELINE
         values = row[sequences].dropna().astype(float)
-        inside = values[(values < reach) & (values > 1 / reach)]
+        shown = values.clip(1 / reach, reach)
+        inside = values[values == shown]
+        ends = row[["low", "high"]].astype(float)
         panel.plot(inside, [y - 0.1] * len(inside), "o", alpha=0.45, **dot)
-        for edge, marker, beyond in (
-            (1 / reach, "<", values[values <= 1 / reach]),
-            (reach, ">", values[values >= reach]),
-        ):
-            if len(beyond):
-                named = [f"{name}: {value:.3g}" for name, value in beyond.items()]
-                place: dict[str, Any] = {"ha": "right" if edge > 1 else "left", "fontsize": 7}
-                panel.plot(edge, y - 0.1, marker, clip_on=False, **dot)
-                panel.text(edge, y - 0.22, f" {', '.join(named)} ", va="bottom", **place)
-        interval = np.clip([row["low"], row["high"]], 1 / reach, reach)
-        panel.plot(interval, [y + 0.2] * 2, **style.interval_style(color, "|"))
-        for edge, marker, is_cut in (
-            (1 / reach, "<", row["low"] < 1 / reach),
-            (reach, ">", row["high"] > reach),
-        ):
-            if is_cut:
-                panel.plot(edge, y + 0.2, marker, color=color, markersize=5, clip_on=False)
+        panel.plot(ends.clip(1 / reach, reach), [y + 0.2] * 2, **style.interval_style(color, "|"))
         panel.plot(row["ratio"], y + 0.2, "D", color=color, markersize=4, markeredgewidth=0)
+        for edge, (marker, side) in edges.items():
+            beyond = values[(shown == edge) & (values != shown)]
+            if len(beyond):
+                named = ", ".join(f"{name}: {value:.3g}" for name, value in beyond.items())
+                panel.plot(edge, y - 0.1, marker, clip_on=False, **dot)
+                panel.text(edge, y - 0.22, f" {named} ", va="bottom", ha=side, fontsize=7)
+            if ((ends - edge) * (edge - 1) > 0).any():  # farther from 1 than the edge
+                panel.plot(edge, y + 0.2, marker, color=color, markersize=5, clip_on=False)
     panel.axvline(1, color="black", linewidth=0.8)
     panel.grid(axis="y", visible=False)
     panel.set_yticks(range(len(order)), order)

@@ -4,7 +4,6 @@ import importlib.metadata
 import platform
 import subprocess
 from contextlib import suppress
-from pathlib import Path
 from typing import Any
 
 import mistune
@@ -16,9 +15,6 @@ from keypoint_study.report.style import Artefact
 from thesis_repro.running.provenance import ROOT
 
 PAGE = "index.html"
-ENDINGS = {"figure": (".svg", ".webp", ".pdf"), "table": (".csv", ".md", ".tex"), "text": (".md",)}
-OPENING = ("findings", "figure-comparison", "table-summary")  # ids of those at the top of a page
-ROWS_SHOWN = 36  # of a table; a longer one is linked
 # packages that affect the numbers most
 PACKAGES = (
     "tensorflow",
@@ -29,10 +25,6 @@ PACKAGES = (
     "opencv-contrib-python",
     "numpy",
 )
-# what only some artefacts have: those of the thesis; a text that the page folds in part; a table,
-# and one that is short enough to be shown
-DEFAULTS: dict[str, Any] = {"number": None, "makers": [], "thesis": {}, "left_out": None}
-DEFAULTS |= {"content": None, "details": None, "rows": 0, "markdown": None}
 
 
 def page_of(artefacts: list[dict[str, Any]], **facts: Any) -> str:
@@ -56,41 +48,6 @@ def described(artefact: Artefact, files: list[str]) -> dict[str, Any]:
         details = from_markdown(f"## {rest}") if heading else None
         return {**values, "kind": "text", "content": from_markdown(first), "details": details}
     return {**values, "kind": "figure"}
-
-
-def describe(folder: Path, artefact: dict[str, Any]) -> dict[str, Any]:
-    """Return the values that a template needs to show an artefact, or to report it as missing."""
-    kind, name = artefact["kind"], artefact["name"]
-    files = [path for end in ENDINGS[kind] if (path := folder / f"{name}{end}").is_file()]
-    content = {}
-    if files and kind == "text":
-        content = _of_text(files[0].read_text(encoding="utf-8"))
-    elif files and kind == "table" and files[0].suffix == ".csv":
-        content = _of_table(files[1].read_text(encoding="utf-8"))
-    there = bool(files) and (kind == "figure" or bool(content))
-    identity = name if kind == "text" else f"{kind}-{name}"
-    described = {
-        "id": identity,
-        "there": there,
-        "files": [path.name for path in files],
-        "opens": there and identity in OPENING,
-    }
-    return DEFAULTS | artefact | content | described
-
-
-def _of_text(text: str) -> dict[str, Any]:
-    """Return a text in Markdown; the page folds the part after the first heading."""
-    first, heading, rest = text.partition("\n## ")
-    details = from_markdown(f"## {rest}") if heading else None
-    return {"content": from_markdown(first), "details": details}
-
-
-def _of_table(text: str) -> dict[str, Any]:
-    """Return a table in Markdown with its data note."""
-    table, _, _ = text.partition("\n\n")
-    rows = table.count("\n") - 1
-    markdown = text if rows <= ROWS_SHOWN else None
-    return {"content": from_markdown(table), "rows": rows, "markdown": markdown}
 
 
 class _Renderer(mistune.HTMLRenderer):

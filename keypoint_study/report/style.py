@@ -259,22 +259,15 @@ def write_figure(figure: plt.Figure, path: str | Path, **options: Any) -> None:
 def same_on_all_processors(svg: str) -> str:
     """Return the text of an SVG file without what the last bits of its coordinates change.
 
-    Sums of numbers end in other bits with wider vector instructions. So coordinates have three
-    decimals in place of six. Matplotlib names clip paths by a digest of their coordinates; they are
-    numbered here.
+    Sums of numbers end in other bits with wider vector instructions, and Matplotlib can neither
+    round coordinates nor name clip paths by anything but a digest of them. So coordinates have
+    three decimals in place of six, and clip paths are numbered.
     """
     names = dict.fromkeys(re.findall(r'id="([a-z][0-9a-f]{10})"', svg))
-    numbers = {name: number for number, name in enumerate(names, 1)}
-
-    def in_tag(tag: re.Match) -> str:
-        rounded = re.sub(r"(?<![\w.#-])(-?\d+\.\d{4,}|-0(?![\w.]))", _rounded, tag[0])
-        return re.sub(
-            r"""(id="|url\(#|href="#)([a-z][0-9a-f]{10})\b""",
-            lambda link: f"{link[1]}shared{numbers[link[2]]}",
-            rounded,
-        )
-
-    return re.sub(r"<[^>]*>", in_tag, svg)  # not the texts between the tags
+    for number, name in enumerate(names, 1):
+        svg = re.sub(rf'(id="|url\(#|href="#){name}\b', rf"\1shared{number}", svg)
+    number_in_tag = r"(?<![\w.#-])(-?\d+\.\d{4,}|-0(?![\w.]))(?=[^<>]*>)"  # not those of texts
+    return re.sub(number_in_tag, _rounded, svg)
 
 
 def _rounded(number: re.Match) -> str:

@@ -101,6 +101,18 @@ def test_texts_of_figures_can_be_read(name):
     assert [problem for problem in problems(DRAWN[name]()) if "raw TeX: $all$" not in problem] == []
 
 
+def test_a_path_that_strays_is_cut_and_does_not_squeeze_the_others():
+    true, near, strayed = turning(), turning(), turning()
+    near[:, 0, 3] += 0.5
+    strayed[:, :3, 3] *= 100
+    drawn = {"near": near, "far": strayed}
+    above, below = paths.figure_of_paths(drawn, true, "sequence 00").axes
+    assert max(map(abs, [*above.get_xlim(), *above.get_ylim()])) < 8 and below.get_ylim()[1] <= 8
+    assert [text for text in texts(above.figure) if "far" in text] == ["far (leaves the picture)"]
+    alone = paths.figure_of_paths({"far": strayed}, true, "sequence 00")  # nothing to be squeezed
+    assert alone.axes[0].get_ylim()[1] > 500 and "far" in texts(alone)
+
+
 def test_numbers_of_the_convolution_sum_to_its_response():
     figure = chapter2.figure_2_02(*convolution())
     field, weights, products = (
