@@ -23,6 +23,7 @@ exclude_patterns = ["docs/index.md"]  # it is index.md, too
 nb_execution_mode = "off"
 nb_ipywidgets_js: dict = {}  # they would come from the network; pictures stand for sliders
 nb_mime_priority_overrides = [("html", "application/vnd.jupyter.widget-view+json", None)]
+nb_render_markdown_format = "gfm"  # with tables
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 3
 html_theme = "sphinx_book_theme"
