@@ -314,7 +314,7 @@ def test_errors_of_the_lab_that_exercises_06_2_07_1_and_07_2_promise(tmp_path, m
     monkeypatch.setenv(PREFIX + "PROFILE", "lab")
     monkeypatch.setenv(PREFIX + "BUILD", str(tmp_path))
     thesis, sky = last_rows(("classes=(),", 'classes=("sky",),'))  # as if opened first
-    assert sky["keypoints"] < 0.2 * thesis["keypoints"] and sky[ROTATION] > 3 * thesis[ROTATION]
+    assert sky["keypoints"] < 0.3 * thesis["keypoints"] and sky[ROTATION] > 3 * thesis[ROTATION]
     run("06", MASKS)
     low, high = ranges()
     assert low.loc["500 keypoints", "RMSE (m)"] < high.loc["as above", "RMSE (m)"]
