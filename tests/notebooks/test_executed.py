@@ -101,7 +101,8 @@ def test_sliders_show_the_numbers_of_the_cells_above_after_all_cells(executed, n
 def test_a_failing_notebook_does_not_stop_the_others(tmp_path):
     """On a copy of the project with small notebooks; copies beside the nine are left alone."""
     root = tmp_path / "project"
-    for folder in ("thesis_repro", "street_world", "notebooks/thesis", "tools", "docs"):
+    packages = "thesis_repro", "keypoint_study", "opencv_exact", "street_world"
+    for folder in (*packages, "notebooks/thesis", "tools", "docs"):
         shutil.copytree(ROOT / folder, root / folder, ignore=shutil.ignore_patterns("__pycache__"))
     (root / ".venv").symlink_to(ROOT / ".venv")
     for name in ("Makefile", "environment.txt", "pyproject.toml"):
