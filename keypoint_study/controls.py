@@ -9,16 +9,20 @@ from typing import Any
 
 import cv2
 import numpy as np
+from scipy.spatial.distance import cdist
 
 from keypoint_study.sources import Source
+from thesis_repro.data.cityscapes import ID
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.masks import dilate
-from thesis_repro.odometry import THESIS
+from thesis_repro.masks.folders import LabelMasks
+from thesis_repro.odometry import THESIS, OdometrySettings
 
 LARGEST_GRADIENT = 8 * 255  # |dx| + |dy| of 3x3 Sobel operators
 COVERAGE_TOLERANCE = 0.002  # of the frame
 SAMPLE = 12  # frames on which the distance between keypoints is chosen
 STEP = 0.1  # pixels between the distances that are tried
+NEIGHBOURHOOD = 40  # pixels
 LINE_WIDTH = 10  # pixels, of lines and edges as controls of ready-made masks, which have no width
 
 
@@ -123,6 +127,55 @@ class ImageEdges(OtherFrame):
             else:
                 high, covered_high = threshold, covered
         return best
+
+
+class WithoutClasses(OtherFrame):
+    """The whole frame but some classes. The label map is enlarged by nearest neighbour."""
+
+    def __init__(
+        self,
+        source: Source,
+        sequence: Sequence,
+        dilation_width: int | None,
+        classes: tuple[str, ...],
+    ) -> None:
+        super().__init__(source, sequence, dilation_width)
+        self.classes = classes
+
+    def record(self) -> list[Any]:
+        """Return what the masks depend on beside files."""
+        return [*super().record(), *self.classes]
+
+    def __getitem__(self, index: int) -> np.ndarray:
+        assert isinstance(self.masks, LabelMasks)  # only those have classes
+        left_out = np.isin(self.masks.label_map(index), [ID[name] for name in self.classes])
+        allowed = np.where(left_out, np.uint8(0), np.uint8(255))
+        return cv2.resize(allowed, self.masks.size[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
+
+
+def beside(
+    frame: np.ndarray, settings: OdometrySettings = THESIS, mask: np.ndarray | None = None
+) -> np.ndarray:
+    """Find keypoints beside a mask: a neighbour off it for each keypoint on it.
+
+    It is the nearest one that no other has taken, the strongest choosing first, up to NEIGHBOURHOOD
+    away. A keypoint without such a neighbour has none, so there are fewer than on the mask.
+    """
+    from thesis_repro.odometry import corners
+
+    everything = corners.detect(frame, settings)
+    if mask is None:
+        return everything
+    columns, rows = everything.astype(int).T
+    off = everything[mask[rows, columns] == 0]
+    chosen = []
+    distances = cdist(corners.detect(frame, settings, mask), off)
+    for of_keypoint in distances if len(off) else ():
+        nearest = of_keypoint.argmin()
+        if of_keypoint[nearest] <= NEIGHBOURHOOD:
+            chosen.append(nearest)
+            distances[:, nearest] = np.inf
+    return off[chosen]
 
 
 def min_distance(sequence: Sequence, number: float) -> float:

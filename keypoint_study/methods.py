@@ -10,15 +10,25 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple, TypeAlias
 
-from keypoint_study.controls import ImageEdges, Mirrored, OtherFrame, RandomLines
+from keypoint_study.controls import (
+    ImageEdges,
+    Mirrored,
+    OtherFrame,
+    RandomLines,
+    WithoutClasses,
+    beside,
+)
 from keypoint_study.sources import Source
+from thesis_repro.data.cityscapes import LABELS
 from thesis_repro.data.kitti import TRUE_LABELS, Sequence
-from thesis_repro.masks import MaskSettings
+from thesis_repro.masks import MOVABLE, MaskSettings
 from thesis_repro.odometry import THESIS, OdometrySettings
+from thesis_repro.odometry.keypoints import filtered, spread
 
 # All corrections together. No error was used to choose them: a label map of 320 columns places a
 # boundary within about 2 pixels of the frame, and within 10 pixels of its border the Lucas-Kanade
 # window of 21 pixels is cut off.
+FEW = 200  # keypoints spread on or off the masks
 CORRECTED = MaskSettings("exact", symmetric=True, movable=2, margin=10)
 
 
@@ -74,6 +84,26 @@ def changed(own: OdometrySettings, changes: Mapping[str, Any]) -> OdometrySettin
     return replace(own, **{name: value for name, value in changes.items() if name in free})
 
 
+def found_by(detector: Callable, choose: Callable[..., Choice]) -> Callable[..., Choice]:
+    """Return a method with the masks of another one, and a detector of its own."""
+
+    def changed_choice(sequence: Sequence, source: Source, width: int | None) -> Choice:
+        settings, masks = choose(sequence, source, width)
+        return replace(settings, detector=detector), masks
+
+    return changed_choice
+
+
+def without(*classes: str) -> Callable[..., Choice]:
+    """Return a method with the thesis's keypoints, but those on some classes."""
+
+    def choose(sequence: Sequence, source: Source, width: int | None) -> Choice:
+        masks = WithoutClasses(source, sequence, width, classes)
+        return replace(THESIS, detector=filtered), masks
+
+    return choose
+
+
 class Method(NamedTuple):
     """A way to choose the keypoints of a run.
 
@@ -123,6 +153,33 @@ METHODS = {  # in the order in which they are shown
     "spread": Method("keypoints spread out", CONTROL, all_keypoints, as_many=True),
     "reduced": Method("reduced keypoints", THESIS_ONLY, all_keypoints),  # Figure 4.12
 }
+# Whether it is what lies under the masks, or where in the frame they are: keypoints beside the
+# masks, and few that are spread over the frame, on the masks or off them.
+IN_PLACE = {
+    f"beside-{name}": Method(
+        f"beside the {METHODS[name].title}", LABEL_MAPS, found_by(beside, METHODS[name].choose)
+    )
+    for name in ("masked", "exact-boundaries", "mirrored")
+} | {
+    f"spread-{where}": Method(
+        f"{FEW} spread {words} the masks", LABEL_MAPS, found_by(spread(FEW), METHODS[name].choose)
+    )
+    for where, words, name in (("on", "over", "masked"), ("off", "off", "inverse"))
+}
+# which class could be left out
+LEFT_OUT = {
+    "vegetation": ("vegetation",),
+    "road and sidewalk": ("road", "sidewalk"),
+    "buildings": ("building", "wall", "fence"),
+    "terrain": ("terrain",),
+    "poles and signs": ("pole", "traffic sign", "traffic light"),
+    "vehicles and people": tuple(LABELS[number].name for number in MOVABLE),
+}
+EXPLORED = IN_PLACE | {
+    f"without-{name.replace(' ', '-')}": Method(f"without {name}", LABEL_MAPS, without(*classes))
+    for name, classes in LEFT_OUT.items()
+}
+METHODS |= {name: method._replace(every_study=False) for name, method in EXPLORED.items()}
 AS_SLAM_SYSTEMS = ("static", "inverse", "static-boundaries")
 # the methods with masks beside "masked", which the tested width of a study is for
 MASK_CONTROLS = [

@@ -293,7 +293,7 @@ def _made(runs: Mapping[Job, Run]) -> dict[Job, odometry.Result | str]:
             continue
         if result.frames["detected"].isna().all():
             made[job] = (
-                f"{sequence.folder}: no frame has any structure (all are black, white or of one "
+                f"sequence {sequence.name}: no frame has any structure (all are black, white or of one "
                 "gray); check how they were written"
             )
     return made

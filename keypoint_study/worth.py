@@ -14,7 +14,7 @@ for its outcomes in `verdicts.WORTH`.
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import replace
 from functools import cache, partial
-from itertools import product
+from itertools import chain, product
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -23,7 +23,7 @@ import numpy as np
 import pandas as pd
 
 import opencv_exact
-from keypoint_study import jobs, ratios, verdicts
+from keypoint_study import jobs, one_fit, ratios, verdicts
 from keypoint_study.methods import METHODS, changed
 from keypoint_study.runner import TABLES, reader_of, record_of
 from keypoint_study.sources import UNMASKED, Source, own_calls
@@ -41,7 +41,7 @@ from thesis_repro.odometry import (
 )
 from thesis_repro.odometry.keypoints import filled, spread
 from thesis_repro.odometry.loop import MIN_MATCHES, normalise
-from thesis_repro.odometry.refined.fit import fit, smaller_rotation
+from thesis_repro.odometry.refined.fit import RefinedMotion, fit, smaller_rotation
 from thesis_repro.odometry.runs import check, inside
 from thesis_repro.odometry.sharing import SharedCalls
 from thesis_repro.running import program, provenance
@@ -51,7 +51,8 @@ from thesis_repro.running.workers import open_pool
 
 NUMBERS = (100, 200, 400)
 DECIDING = 400  # keypoints
-SPLITS, SEED = 3, 0  # splits of each kind
+SPLITS, SEED = 12, 0  # splits of each kind
+FITS = 3  # draws for the measure of one fit
 FIELD = 2 * THESIS.window  # side of a field, pixels
 MAX_STEPS = 200  # of a sequence, at equal distances; no street of the tables has more
 MIN_RANDOM = 20  # random keypoints with which even a choice of fewer is compared
@@ -78,16 +79,18 @@ def worth_of(
     sequence: Sequence,
     chosen: Choices,
     calls: Mapping[str, Calls] = {},
+    splits: int = SPLITS,
 ) -> pd.DataFrame:
     """Return what a keypoint of each choice is worth on a sequence.
 
     chosen: {(name, number): (settings, masks)}, as for `odometry.run_many`; so many keypoints are
     drawn from those that the settings and the masks leave, 0 for all of them. calls: of choices
-    with own keypoints, by name.
+    with own keypoints, by name. splits: of each kind.
 
-    One row a choice, number and split ("fields" or "points"): sequence, choice, number, split,
-    steps; keypoints, the median number; rotation and direction, the worths; rotation_deg and
-    direction_deg, the median angle between two halves.
+    One row a choice, number and split ("fields", "points", or ONE_FIT): sequence, choice, number,
+    split, steps; keypoints, the median number that was drawn; left, the median number that the
+    choice leaves; rotation and direction, the worths; rotation_deg and direction_deg, the median
+    angle between two halves, or the standard deviation of one fit.
     Raises InputError if no step is long enough, and for frames or masks that cannot be read.
     """
     for _, masks in chosen.values():
@@ -95,7 +98,7 @@ def worth_of(
     steps = np.flatnonzero(sequence.scales[1:] >= metrics.MIN_DIRECTED_STEP)
     if not len(steps):
         raise InputError(
-            f"{sequence.folder}: no step of {metrics.MIN_DIRECTED_STEP} m or more, and shorter ones "
+            f"sequence {sequence.name}: no step of {metrics.MIN_DIRECTED_STEP} m or more, and shorter ones "
             "do not show what a keypoint is worth"
         )
     spaced = np.linspace(0, len(steps) - 1, min(len(steps), MAX_STEPS))
@@ -107,17 +110,22 @@ def worth_of(
         halves_of_random = cache(partial(_halves, random))
         for (name, number), tracks in of_choices.items():
             count = min(number or len(tracks.points), len(tracks.points))
-            for split, repeat in product(SPLIT, range(SPLITS)):
+            for split, repeat in chain(
+                product(SPLIT, range(splits)), product([ONE_FIT], range(FITS))
+            ):
                 halves = _halves(tracks, count, split, (SEED, index, repeat, 0))
                 reference = halves_of_random(
                     max(count, MIN_RANDOM), split, (SEED, index, repeat, 1)
                 )
-                row = {"choice": name, "number": number, "split": split, **halves}
+                row = {"choice": name, "number": number, "split": split, "left": len(tracks.points)}
+                row |= halves
                 rows.append(row | {f"random_{name}": value for name, value in reference.items()})
     medians = pd.DataFrame(rows).groupby(["choice", "number", "split"], sort=False).median()
     for name in MOTIONS:
         medians[name] = medians[f"random_{name}_variance"] / medians[f"{name}_variance"]
-    table = medians[["keypoints", *MOTIONS, *(f"{name}_deg" for name in MOTIONS)]].reset_index()
+    table = medians[
+        ["keypoints", "left", *MOTIONS, *(f"{name}_deg" for name in MOTIONS)]
+    ].reset_index()
     table.insert(0, "sequence", sequence.name)
     table.insert(4, "steps", len(steps))
     return table
@@ -157,11 +165,14 @@ def tracked(
 def _halves(tracks: Tracks, count: int, split: str, seed: tuple[int, ...]) -> dict[str, float]:
     """Draw keypoints, divide them, and return how far the motions of both halves are apart.
 
+    Or, for ONE_FIT, how uncertain the motion of all of them is.
     {keypoints; rotation_deg, direction_deg: angles; rotation_variance, direction_variance: of one
     keypoint, degrees^2}
     """
     random = np.random.default_rng(seed)
     drawn = random.permutation(len(tracks.points))[:count]
+    if split == ONE_FIT:
+        return _one_fit(tracks, drawn)
     in_first = SPLIT[split](tracks.points[drawn], random)
     first, second = drawn[in_first], drawn[~in_first]
     angles = _angles(refined_motion(tracks, first), refined_motion(tracks, second))
@@ -169,6 +180,21 @@ def _halves(tracks: Tracks, count: int, split: str, seed: tuple[int, ...]) -> di
     numbers: dict[str, float] = {"keypoints": len(drawn)}
     for motion, angle in zip(MOTIONS, angles, strict=True):
         numbers |= {f"{motion}_deg": angle, f"{motion}_variance": angle**2 * weight}
+    return numbers
+
+
+def _one_fit(tracks: Tracks, drawn: np.ndarray) -> dict[str, float]:
+    """Return what `_halves` returns, from the covariance of the motion of all drawn keypoints."""
+    variances = NO_MOTION**2, NO_MOTION**2
+    motion, found = refined_motion(tracks, drawn), drawn[tracks.found[drawn]]
+    if motion is not None:
+        matches = Matches(tracks.current[found], tracks.previous[found], tracks.threshold)
+        _, fields = np.unique(tracks.points[found] // FIELD, axis=0, return_inverse=True)
+        variances = one_fit.variances(motion, matches, fields.ravel())
+    numbers: dict[str, float] = {"keypoints": len(drawn)}
+    for name, variance in zip(MOTIONS, variances, strict=True):
+        variance = min(variance, NO_MOTION**2)
+        numbers |= {f"{name}_deg": variance**0.5, f"{name}_variance": variance * max(len(drawn), 1)}
     return numbers
 
 
@@ -185,9 +211,10 @@ def _by_points(points: np.ndarray, random: np.random.Generator) -> np.ndarray:
 
 
 SPLIT: dict[str, Callable] = {"fields": _by_fields, "points": _by_points}
+ONE_FIT = "fit"  # in place of a split: the second measure (one_fit.py)
 
 
-def refined_motion(tracks: Tracks, indices: np.ndarray) -> Motion | None:
+def refined_motion(tracks: Tracks, indices: np.ndarray) -> RefinedMotion | None:
     """Return the refined motion of some keypoints; None if they give none."""
     indices = indices[tracks.found[indices]]
     if len(indices) < MIN_MATCHES:
@@ -217,42 +244,45 @@ def choices_of(
     sequence: Sequence,
     sources: Iterable[Source],
     width: int | None,
-    number: int,
+    numbers: Iterable[int] = (DECIDING,),
     with_controls: bool = True,
     masked_settings: Mapping[str, Any] = {},
     named: Collection[str] = (),
 ) -> tuple[Choices, dict[str, Path]]:
     """Return the choices of a study for `worth_of`, and the files of own keypoints by name.
 
-    Keypoints of every source, and without it random, spread and the strongest ones. number: see
-    `worth_of`; only for all of a choice (0), there are no spread and strongest ones. with_controls:
-    also masks that are filled, and the controls of `jobs.mask_controls`; named: see there.
+    numbers: see `worth_of`. Random and spread keypoints, masks and own keypoints have each of them,
+    the other choices only DECIDING. with_controls: also masks that are filled, and the controls of
+    `jobs.mask_controls`; named: see there.
     """
-    chosen: dict[str, tuple] = {"random keypoints": (THESIS, None)}
+    chosen: dict[tuple[str, int], tuple] = {}
     own = {}
-    if number:
-        chosen["spread keypoints"] = replace(THESIS, detector=spread(number)), None
-        chosen["strongest keypoints"] = replace(THESIS, max_keypoints=number), None
+    for number in numbers:
+        chosen["random keypoints", number] = THESIS, None
+        if number:
+            chosen["spread keypoints", number] = replace(THESIS, detector=spread(number)), None
+    chosen["strongest keypoints", DECIDING] = replace(THESIS, max_keypoints=DECIDING), None
     masked = replace(THESIS, **masked_settings)
     for source in sources:
         prefix = f"{source.name}: " if source.name else ""
         if source.kind == "keypoints":
             own[source.name] = source.folder
-            chosen[source.name] = THESIS, None
+            chosen |= {(source.name, number): (THESIS, None) for number in numbers}
         if source.kind in UNMASKED:
             continue
         masks = source.masks(sequence, width)
-        chosen[f"{prefix}masks"] = masked, masks
-        if number:
-            chosen[f"{prefix}strongest on the masks"] = replace(masked, max_keypoints=number), masks
+        chosen |= {(f"{prefix}masks", number): (masked, masks) for number in numbers}
+        strongest = replace(masked, max_keypoints=DECIDING)
+        chosen[f"{prefix}strongest on the masks", DECIDING] = strongest, masks
         if with_controls:
-            more = filled(FILL, masked.detector)
-            chosen[f"{prefix}masks, filled"] = replace(masked, detector=more), masks
+            more = replace(masked, detector=filled(FILL, masked.detector))
+            chosen[f"{prefix}masks, filled", DECIDING] = more, masks
             controls = jobs.mask_controls(source, sequence, width, named)
             for name, width_of_control in controls.items():
                 settings, control = METHODS[name].choose(sequence, source, width_of_control)
-                chosen[prefix + METHODS[name].title] = changed(settings, masked_settings), control
-    return {(name, number): choice for name, choice in chosen.items()}, own
+                settings = changed(settings, masked_settings)
+                chosen[prefix + METHODS[name].title, DECIDING] = settings, control
+    return chosen, own
 
 
 def worths_of(
@@ -275,18 +305,19 @@ def worths_of(
     digest = cache(provenance.digest_of_files)
     calls: list[tuple] = []
     for sequence in sequences:
-        deciding, own = choices_of(sequence, sources, width, DECIDING, **options)
+        chosen, own = choices_of(sequence, sources, width, numbers, **options)
+        records = {
+            f"{name} {number}": record_of(*chosen[name, number], digest) for name, number in chosen
+        }
         stage = provenance.stage(
             folder / sequence.name,
             sequence=sequence.digest(),
-            choices={name: record_of(*choice, digest) for (name, _), choice in deciding.items()},
+            choices=records,
             own={name: digest((file,)) for name, file in own.items()},
             code=digest_of_code(_measure_one, *reader_of(sequence), without=TABLES),
             **provenance.versions("opencv", "numpy", "numba"),
         )
-        for number in numbers:
-            chosen, _ = choices_of(sequence, sources, width, number, **options)
-            calls.append((stage / f"{number}.csv", sequence, chosen, own))
+        calls.append((stage / "worth.csv", sequence, chosen, own))
     missing = [call for call in calls if not call[0].is_file()]
     # the first step of a sequence compiles, so it says nothing about the time of the others
     steps = [min(len(sequence), MAX_STEPS) for _, sequence, *_ in missing]
@@ -314,7 +345,7 @@ def _measure_one(file: Path, sequence: Sequence, chosen: Choices, own: Mapping[s
     except InputError as error:
         return str(error)
     except Exception as error:  # of own keypoints
-        return f"{sequence.folder}: {cause(error)}"
+        return f"sequence {sequence.name}: {cause(error)}"
     provenance.write_table(file, table)
     return ""
 
@@ -328,21 +359,35 @@ def typical_worths(table: pd.DataFrame) -> pd.DataFrame:
     table: of `worth_of`, of several sequences. One row a choice and number: keypoints, n
     (sequences), verdict; for each motion and split, such as rotation_fields: the typical worth, its
     interval (_low, _high), and the number of sequences with a worth below 1 (_below).
+    verdict_of_fit: that of the second measure, which decides nothing.
     """
     rows = []
     for (choice, number), chosen in table.groupby(["choice", "number"], sort=False):
         row = {"choice": choice, "number": number, "keypoints": chosen["keypoints"].mean()}
-        worths = {}
+        worths: dict[str, pd.Series] = {}
         for motion in MOTIONS:
             for split, of_split in chosen.groupby("split", sort=False):
                 worths[f"{motion}_{split}"] = np.log(of_split[motion])
-        row |= {"n": chosen["sequence"].nunique(), "verdict": _verdict(worths)}
+        of_fit = {name: worths[name] for name in worths if name.endswith(ONE_FIT)}
+        of_halves = {name: worths[name] for name in worths if name not in of_fit}
+        row |= {"n": chosen["sequence"].nunique(), "verdict": _verdict(of_halves)}
+        if of_fit:
+            row["verdict_of_fit"] = _verdict(of_fit)
         for name, logarithms in worths.items():
             numbers = np.exp(ratios.typical_interval(logarithms))
             row |= dict(zip((name, f"{name}_low", f"{name}_high"), numbers, strict=True))
             row[f"{name}_below"] = int((logarithms < 0).sum())
         rows.append(row)
     return pd.DataFrame(rows)
+
+
+def over(table: pd.DataFrame, choice: str, other: str) -> pd.DataFrame:
+    """Return the worths of one choice divided by those of another, as rows of the same table."""
+    keys, names = ["sequence", "number", "split"], list(MOTIONS)
+    first, second = (table[table["choice"] == name].set_index(keys) for name in (choice, other))
+    divided = (first[names] / second[names]).dropna()
+    rows = first.loc[divided.index].assign(choice=f"{choice}, over {other}", **divided)
+    return rows.reset_index()[list(table)]
 
 
 def _verdict(worths: Mapping[str, pd.Series]) -> str:

@@ -13,6 +13,7 @@ from keypoint_study.jobs import first_jobs, runs_of
 from keypoint_study.sources import Source
 from thesis import ablations, section_4_2
 from thesis_repro import masks
+from thesis_repro.data.cityscapes import ID
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.masks import folders
 from thesis_repro.odometry import THESIS, keypoints
@@ -31,7 +32,7 @@ def made(sequence, small_labels):
     """Masks of every control and of the thesis, by method."""
     source = Source(small_labels)
     by_method = {"masked": folders.LabelMasks(small_labels / "00", sequence, WIDTH)}
-    for method in methods.MASK_CONTROLS:
+    for method in set(methods.MASK_CONTROLS) - set(methods.EXPLORED):
         _, by_method[method] = methods.METHODS[method].choose(sequence, source, WIDTH)
     return by_method
 
@@ -97,12 +98,58 @@ def test_a_methods_own_settings_win_and_nothing_joins_a_study_unasked(
         runs = runs_of(planned, [sequence], [source], {"scale_gate": 0.5}, few)
         settings = {job.method: run.settings for job, run in runs.items()}
         assert set(named) == {"orb-on-masks"} & set(settings)
-        chosen, _ = worth.choices_of(sequence, [source], WIDTH, 400, True, few, named)
+        chosen, _ = worth.choices_of(sequence, [source], WIDTH, (400,), True, few, named)
         assert set(named) == {"orb-on-masks"} if ("ORB on masks", 400) in chosen else not named
     assert settings["masked"].detector == keypoints.spread(200)
     assert settings["orb-on-masks"] == replace(THESIS, detector=keypoints.orb, scale_gate=0.5)
     assert chosen["ORB on masks", 400][0].detector is keypoints.orb
     assert chosen["mirrored mask", 400][0].detector == keypoints.spread(200)
+
+
+def explored(name, sequence, small_labels, index=3):
+    """The frame and keypoints of a method that a study has to name, and its mask."""
+    settings, given = methods.METHODS[name].choose(sequence, Source(small_labels), WIDTH)
+    frame, mask = sequence.frame(index), given[index]
+    return frame, settings.detector(frame, settings, mask), mask
+
+
+@pytest.mark.parametrize("name, on", [("spread-on", True), ("spread-off", False)])
+def test_keypoints_are_spread_on_or_off_the_masks(name, on, sequence, small_labels, made):
+    _, points, _ = explored(name, sequence, small_labels)
+    columns, rows = points.astype(int).T
+    assert len(points) == methods.FEW and ((made["masked"][3][rows, columns] > 0) == on).all()
+
+
+def test_keypoints_beside_masks_are_near_them_and_none_is_taken_twice(sequence, small_labels):
+    frame, points, mask = explored("beside-masked", sequence, small_labels)
+    columns, rows = points.astype(int).T
+    on = detect(frame, THESIS, mask)
+    assert 50 < len(points) <= len(on) and (mask[rows, columns] == 0).all()
+    assert len(np.unique(points, axis=0)) == len(points)
+    distances = np.linalg.norm(points[:, None] - on, axis=2)
+    assert distances.min(axis=1).max() <= controls.NEIGHBOURHOOD
+    # the strongest keypoint has the nearest one of all off the mask
+    columns, rows = (everything := detect(frame, THESIS)).astype(int).T
+    off = everything[mask[rows, columns] == 0]
+    nearest = np.linalg.norm(off - on[0], axis=1).min()
+    assert nearest > controls.NEIGHBOURHOOD or distances[0, 0] == nearest
+
+
+def test_a_class_is_left_out(sequence, small_world, small_labels):
+    frame, points, _ = explored("without-road-and-sidewalk", sequence, small_labels)
+    path = small_world / "kitti/sequences/00/labels_0/000003.png"
+    true = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    everything = detect(frame, THESIS)
+    # label maps have a fourth of the frame's columns, so borders of classes are left out here
+    ids = [ID["road"], ID["sidewalk"]]
+    near, inside = (
+        kind(np.isin(true, ids).astype(np.uint8), np.ones((9, 9)))
+        for kind in (cv2.dilate, cv2.erode)
+    )
+    columns, rows = points.astype(int).T
+    assert 0 < len(points) < len(everything) and not inside[rows, columns].any()
+    columns, rows = everything.astype(int).T
+    assert len(points) >= (near[rows, columns] == 0).sum()
 
 
 def test_random_lines_and_image_edges_cover_as_much_as_the_mask(sequence, made):

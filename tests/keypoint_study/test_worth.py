@@ -8,6 +8,7 @@ import pytest
 from street import Street
 
 from keypoint_study import verdicts, worth
+from thesis_repro import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.odometry import OPENCV, THESIS
 
@@ -186,10 +187,39 @@ def test_what_the_camera_did_not_see_has_no_keypoints(monkeypatch):
 
 def test_steps_without_lengths_are_all_kept_and_short_ones_are_not():
     street = Street(4)
-    street.poses[2:, :3, 3] = street.poses[1, :3, 3]  # the last two steps are short
-    assert (worth.worth_of(street, {("all", 0): (THESIS, None)})["steps"] == 1).all()
-    street.has_truth, street.speed = False, None
-    assert (worth.worth_of(street, {("all", 0): (THESIS, None)})["steps"] == 3).all()
-    street.folder, street.speed, street.times = "street", 0.0, np.arange(4)
+    lengths = {(0, 1, 0.1, 0.1): 1, None: 3}  # steps that are kept
+    for scales, kept in lengths.items():
+        drive = Sequence.from_arrays(street.images, street.intrinsics, scales=scales)
+        assert (worth.worth_of(drive, {("all", 0): (THESIS, None)})["steps"] == kept).all()
+    drive = Sequence.from_arrays(street.images, street.intrinsics, scales=[0, 0.1, 0.1, 0.1])
     with pytest.raises(InputError):
-        worth.worth_of(street, {("all", 0): (THESIS, None)})
+        worth.worth_of(drive, {("all", 0): (THESIS, None)})
+
+
+def test_one_choice_is_divided_by_another():
+    rows = [
+        (name, choice, 400, "fields", worth_of_choice, worth_of_choice / 2)
+        for name in ("00", "01")
+        for choice, worth_of_choice in (("masks", 0.5), ("beside", 2.0))
+    ]
+    columns = ["sequence", "choice", "number", "split", "rotation", "direction"]
+    divided = worth.over(pd.DataFrame(rows, columns=columns), "masks", "beside")
+    assert list(divided["rotation"]) == list(divided["direction"]) == [0.25, 0.25]
+    assert list(divided["sequence"]) == ["00", "01"] and divided["choice"].nunique() == 1
+
+
+@pytest.mark.slow
+def test_one_fit_sees_what_neighbours_share():
+    """Its variance is that of the errors, also where a keypoint has a copy."""
+    truth = type("Truth", (), {"rotation": np.eye(3), "translation": FORWARD})
+    for make in (independent, copied):
+        told, true = [], []
+        for scene in range(60):
+            simulated = make(np.random.default_rng(scene))
+            every = np.arange(len(simulated.points))
+            told.append(worth._one_fit(simulated, every))
+            true.append(worth._angles(worth.refined_motion(simulated, every), truth))
+        means = pd.DataFrame(told).mean() / len(every)
+        squares = np.square(true).mean(axis=0)
+        for name, square in zip(worth.MOTIONS, squares, strict=True):
+            assert means[f"{name}_variance"] == pytest.approx(square, rel=0.6), (make, name)

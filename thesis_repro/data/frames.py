@@ -102,7 +102,8 @@ def _check_kinds(folder: Path, paths: list[Path]) -> None:
     """Raise InputError if pictures of two kinds, such as left and right, have the same numbers."""
     kinds = {re.sub(r"\d+", "*", path.name) for path in paths}
     numbers = {tuple(re.findall(r"\d+", path.stem)) for path in paths}
-    if 2 <= len(kinds) <= MAX_KINDS and len(numbers) <= SHARED_NUMBERS * len(paths):
+    numbered = () not in numbers
+    if numbered and 2 <= len(kinds) <= MAX_KINDS and len(numbers) <= SHARED_NUMBERS * len(paths):
         raise InputError(
             f"{folder}: holds {' and '.join(sorted(kinds))} with the same numbers; move all but one "
             "camera's frames away"
