@@ -79,13 +79,13 @@ def worth_of(
     sequence: Sequence,
     chosen: Choices,
     calls: Mapping[str, Calls] = {},
-    splits: int = SPLITS,
+    splits: int | None = None,
 ) -> pd.DataFrame:
     """Return what a keypoint of each choice is worth on a sequence.
 
     chosen: {(name, number): (settings, masks)}, as for `odometry.run_many`; so many keypoints are
     drawn from those that the settings and the masks leave, 0 for all of them. calls: of choices
-    with own keypoints, by name. splits: of each kind.
+    with own keypoints, by name. splits: of each kind, SPLITS if not given.
 
     One row a choice, number and split ("fields", "points", or ONE_FIT): sequence, choice, number,
     split, steps; keypoints, the median number that was drawn; left, the median number that the
@@ -111,7 +111,7 @@ def worth_of(
         for (name, number), tracks in of_choices.items():
             count = min(number or len(tracks.points), len(tracks.points))
             for split, repeat in chain(
-                product(SPLIT, range(splits)), product([ONE_FIT], range(FITS))
+                product(SPLIT, range(splits or SPLITS)), product([ONE_FIT], range(FITS))
             ):
                 halves = _halves(tracks, count, split, (SEED, index, repeat, 0))
                 reference = halves_of_random(

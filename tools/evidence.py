@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 
 from keypoint_study import comparisons, jobs, ratios, runner, worth
+from keypoint_study.methods import EXPLORED, IN_PLACE, METHODS
 from keypoint_study.report import style, texts
 from keypoint_study.report import worths as report_worths
 from keypoint_study.sources import Source
@@ -33,6 +34,7 @@ KEPT = (
     "audit",
     "budget",
 )
+NEW_STREETS = ("03", "04", "drive0009")  # docs/reading-results.md has their rule
 RUNS = ("runs", "shuffled_runs", "ablations")  # tables of runs in the build folder
 # What the sequences show at their start: 00 to 10 are KITTI odometry's, the others raw drives.
 STREETS = {
@@ -75,6 +77,7 @@ def write(settings, folder):
         settings.build / "worth",
         (worth.DECIDING, 0, 200, 100),
         settings.jobs,
+        named=tuple(EXPLORED),
     )
     of_widths = runs_of_widths(settings, sequences, labels)
     streets = _streets(sequences)
@@ -82,12 +85,16 @@ def write(settings, folder):
     for name in KEPT:
         _copy(settings.figures, name, folder)
     style.save_figure(few_keypoints.figure_of_few(few), folder, "few_keypoints", note)
-    for artefact in (report_worths.figure_of_worths(worths), report_worths.table_of_worths(worths)):
+    told = worths[~worths["choice"].isin([method.title for method in EXPLORED.values()])]
+    for artefact in (report_worths.figure_of_worths(told), report_worths.table_of_worths(told)):
         style.save(artefact, folder, note)
     for_readers = {
         "streets": streets,
         "few_keypoints": few_keypoints.table_of_few(few, times),
         "refined_widths": table_of_widths(of_widths),
+        "in_place": table_of_places(worths),
+        "left_out": table_of_classes(worths),
+        "new_streets": table_of_new_streets(worths),
     }
     for name, rows in for_readers.items():
         style.save_table(rows, folder, name, note)
@@ -160,6 +167,32 @@ def table_of_widths(runs):
             row[title] = f"{texts.short(ratio)}, {ratio['above']} of {ratio['n']} above 1"
         rows.append(row | {"failed runs": ratios.count_failed(of_width)})
     return pd.DataFrame(rows)
+
+
+def table_of_places(worths):
+    """Return what masks tell, what keypoints beside them tell, and the one over the other."""
+    titles = {name: METHODS[name].title for name in METHODS}
+    of_masks = ["masked", "exact-boundaries", "mirrored"]
+    shown = [titles[name] for name in (*of_masks, *IN_PLACE)]
+    divided = [worth.over(worths, titles[name], titles[f"beside-{name}"]) for name in of_masks]
+    chosen = worths[worths["choice"].isin(shown) & (worths["number"] == worth.DECIDING)]
+    decisive = [rows[rows["number"] == worth.DECIDING] for rows in divided]
+    return report_worths.table_of_worths(pd.concat([chosen, *decisive])).content
+
+
+def table_of_classes(worths):
+    """Return what random keypoints tell without those on one class."""
+    titles = [method.title for name, method in EXPLORED.items() if name not in IN_PLACE]
+    return report_worths.table_of_worths(worths[worths["choice"].isin(titles)]).content
+
+
+def table_of_new_streets(worths):
+    """Return the worths, by fields, on the streets that nothing was chosen on: one row each."""
+    choices = ["random keypoints", "spread keypoints", "masks"]
+    rows = worths[worths["sequence"].isin(NEW_STREETS) & worths["choice"].isin(choices)]
+    rows = rows[(rows["split"] == "fields") & (rows["number"] == worth.DECIDING)]
+    columns = ["sequence", "choice", "keypoints", "direction", "rotation"]
+    return rows[columns].round({"direction": 2, "rotation": 2}).sort_values(columns[:2])
 
 
 def _streets(sequences):

@@ -31,7 +31,10 @@ def table_of_worths(worths: pd.DataFrame) -> Artefact:
         for split in SPLIT:
             for motion in SHOWN:
                 line[f"{motion}, by {split}"] = cell(row, f"{motion}_{split}")
-        lines.append(line | {"a keypoint tells": row["verdict"]})
+        line["a keypoint tells"] = row["verdict"]
+        if "verdict_of_fit" in row:
+            line["by one fit"] = row["verdict_of_fit"]
+        lines.append(line)
     return Artefact(
         "worth",
         "What a keypoint is worth, in numbers",
@@ -39,7 +42,8 @@ def table_of_worths(worths: pd.DataFrame) -> Artefact:
         f"the number of sequences with less than random keypoints. By fields: squares of {FIELD} "
         "pixels go into one half as a whole, so what neighbours share counts once. By points: "
         "keypoint by keypoint. A keypoint tells less or more only if both splits say so, for "
-        "direction and rotation. worth_runs.csv has every sequence.",
+        "direction and rotation. By one fit: what the covariance of a single fit says, which decides "
+        "nothing. worth_runs.csv has every sequence.",
         pd.DataFrame(lines),
     )
 
