@@ -64,9 +64,14 @@ def lesson(name, notebook):
 def say_what_is_seen(app, doctree):
     """Give the pictures of each cell their alternative texts."""
     for cell in doctree.findall(nodes.container):
-        words = cell.get("cell_metadata", {}).get("seen", [])
-        for picture, text in zip(cell.findall(nodes.image), words):
-            picture["alt"] = text
+        words = iter(cell.get("cell_metadata", {}).get("seen", []))
+        for output in cell.findall(
+            lambda node: getattr(node, "attributes", {}).get("nb_element") == "mime_bundle"
+        ):
+            pictures = list(output.findall(nodes.image))  # the same one, in several formats
+            text = next(words, None) if pictures else None
+            for picture in pictures if text else ():
+                picture["alt"] = text
 
 
 def line_of_mathml(translator, node):

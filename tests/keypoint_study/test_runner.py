@@ -138,7 +138,7 @@ def test_a_sequence_without_structure_has_no_result(tiny_kitti, tmp_path):
     assert (outcome.made, outcome.kept, outcome.failed_jobs) == (2, 0, 2)
     assert set(outcome.table["sequence"]) == {"00"}
     assert len(outcome.warnings) == 1 and "sequence 01, " in outcome.warnings[0]
-    with pytest.raises(InputError, match="sequences/01: "):
+    with pytest.raises(InputError, match="sequence 01: "):
         runner.run_all(runs_of(jobs[2:], sequences, tmp_path / "none"), tmp_path / "runs")
 
 

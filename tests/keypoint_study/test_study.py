@@ -339,6 +339,6 @@ def test_a_study_without_ground_truth_says_what_keypoints_are_worth(
     shown = pd.read_csv(tmp_path / "out" / "worth.csv")
     assert list(shown["choice"]) == list(table["choice"].unique())
     assert (tmp_path / "out" / "worth.svg").is_file()
-    again = (tmp_path / "out" / "worth" / "00" / "400.csv").stat().st_mtime_ns
+    again = (tmp_path / "out" / "worth" / "00" / "worth.csv").stat().st_mtime_ns
     assert main(list(map(str, words))) == 0  # reads what is there
-    assert (tmp_path / "out" / "worth" / "00" / "400.csv").stat().st_mtime_ns == again
+    assert (tmp_path / "out" / "worth" / "00" / "worth.csv").stat().st_mtime_ns == again
