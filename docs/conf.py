@@ -31,6 +31,7 @@ html_theme_options = {"navbar_persistent": []}  # one field for searches, not tw
 html_math_renderer = "mathml"  # browsers show it without scripts, so without the network
 html_static_path = html_css_files = ["book.css"]
 html_show_copyright = False
+author = "the contributors of thesis-repro"
 html_last_updated_fmt = None
 
 captions = json.loads(CAPTIONS.read_text(encoding="utf-8"))
