@@ -142,12 +142,12 @@ class Study:
         lines = {}
         for sequence in self.opened:
             reasons = [
-                metrics.foreign_truth(estimate, sequence.poses)
+                metrics.foreign_poses(sequence.poses, estimate)
                 for (name, _), estimate in poses.items()
                 if name == sequence.name
             ]
             if reasons and all(reasons):  # with every estimator
-                lines[sequence.name] = f"{sequence.poses_path}: {reasons[0]}"
+                lines[sequence.name] = f"{sequence.poses_path}: true {reasons[0]}"
         if set(runs["sequence"]) == set(lines):
             line = next(iter(lines.values()))
             raise InputError(f"{line}; no sequence with other poses is left to compare")

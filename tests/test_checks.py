@@ -146,6 +146,6 @@ def test_masks_that_cannot_be_right(tiny_kitti, tmp_path, kind, picture, options
     source = MaskFolder(folder, sequence)
     if kind == "labels":
         source = LabelMasks(folder, sequence, 3, MaskSettings(**options))
-        assert "label maps hold" in checks.describe_masks(source, sequence)
-    warnings = checks.mask_warnings(source)
+    line, warnings = checks.look_at_masks(source, sequence)
+    assert ("label maps hold" in line) == (kind == "labels")
     assert [warning in line for line in warnings] == ([True] if warning else [])

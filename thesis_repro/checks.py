@@ -200,15 +200,26 @@ def run_warnings(
     return [f"sequence {name}: {text}" for applies, text in told if applies]
 
 
-def mask_warnings(source: LabelMasks | MaskFolder) -> list[str]:
-    """Warn of what is certainly wrong with masks, seen on MASK_SAMPLES of them.
+def look_at_masks(
+    source: LabelMasks | MaskFolder, sequence: kitti.Sequence
+) -> tuple[str, list[str]]:
+    """Look at about MASK_SAMPLES masks of a sequence, spread evenly over it.
 
-    Raises InputError if one of them cannot be read.
+    Returns one line that says what they keep, and what label maps hold, and at most one warning of
+    what is certainly wrong. Raises InputError if one of them cannot be read.
     """
-    shares = [coverage(source[index]) for index in _sampled(source)]
+    folder = source.paths[0].parent
+    sampled = np.unique(np.linspace(0, len(source) - 1, MASK_SAMPLES).astype(int)).tolist()
+    shares = [coverage(source[index]) for index in sampled]
+    line = f"{folder}: masks keep {np.mean(shares):.1%} of {sequence.name}"
     of_classes, has_label_ids = np.ones(cityscapes.N_CLASSES), False
     if isinstance(source, LabelMasks):
-        of_classes, has_label_ids = _class_shares(source), source.settings.ids == "labels"
+        of_classes, has_label_ids = _class_shares(source, sampled), source.settings.ids == "labels"
+        if source.dilation_width is not None:
+            line += f" (width {source.dilation_width})"
+        classes = zip(cityscapes.LABELS, of_classes, strict=False)
+        held = [f"{label.name} {share:.0%}" for label, share in classes if share >= MIN_SHARE]
+        line += f"; label maps hold {', '.join(held)}"
     ids = np.flatnonzero(of_classes)
     seldom = max(SELDOM, key=lambda label: of_classes[label.id])
     told = [
@@ -238,29 +249,11 @@ def mask_warnings(source: LabelMasks | MaskFolder) -> list[str]:
             "masks",
         ),
     ]
-    return [f"{source.paths[0].parent}: {text}" for applies, text in told if applies][:1]
+    return line, [f"{folder}: {text}" for applies, text in told if applies][:1]
 
 
-def describe_masks(source: LabelMasks | MaskFolder, sequence: kitti.Sequence) -> str:
-    """Return one line that says what masks of a sequence keep, and what label maps hold."""
-    share = np.mean([coverage(source[index]) for index in _sampled(source)])
-    line = f"{source.paths[0].parent}: masks keep {share:.1%} of {sequence.name}"
-    if isinstance(source, LabelMasks):
-        shares = zip(cityscapes.LABELS, _class_shares(source), strict=False)
-        held = [f"{label.name} {share:.0%}" for label, share in shares if share >= MIN_SHARE]
-        if source.dilation_width is not None:
-            line += f" (width {source.dilation_width})"
-        line += f"; label maps hold {', '.join(held)}"
-    return line
-
-
-def _sampled(source: LabelMasks | MaskFolder) -> list[int]:
-    """Return the numbers of about MASK_SAMPLES frames, spread evenly over a sequence."""
-    return np.unique(np.linspace(0, len(source) - 1, MASK_SAMPLES).astype(int)).tolist()
-
-
-def _class_shares(source: LabelMasks) -> np.ndarray:
+def _class_shares(source: LabelMasks, sampled: list[int]) -> np.ndarray:
     """Return the share of each label id, (N_CLASSES,), in the sampled label maps."""
-    label_maps = [source.label_map(index).ravel() for index in _sampled(source)]
+    label_maps = [source.label_map(index).ravel() for index in sampled]
     counts = np.bincount(np.concatenate(label_maps), minlength=cityscapes.N_CLASSES)
     return counts / counts.sum()

@@ -94,9 +94,9 @@ def test_real_poses_of_other_kinds_are_told(kitti_real):
         (body, "other axes"),
         (axes @ body, "other axes"),
     ):
-        assert kind in metrics.foreign_truth(estimated, poses)
+        assert kind in metrics.foreign_poses(poses, estimated)
     for poses in (true, body @ axes):  # as docs/own-masks.md says
-        assert metrics.foreign_truth(estimated, poses) == ""
+        assert metrics.foreign_poses(poses, estimated) == ""
 
 
 DETECT = """

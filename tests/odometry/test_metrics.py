@@ -151,7 +151,7 @@ def test_true_poses_that_are_not_the_cameras_are_told(change, kind):
     true = winding(60)
     estimated = true.copy()
     estimated[:, :3, 3] += np.random.default_rng(1).normal(0, 0.05, (60, 3))
-    reason = metrics.foreign_truth(estimated, change(true))
+    reason = metrics.foreign_poses(change(true), estimated)
     assert reason == "" if kind is None else kind in reason
     # a path of one camera without its scale
     path = np.array(change(true))
@@ -159,5 +159,5 @@ def test_true_poses_that_are_not_the_cameras_are_told(change, kind):
     told = metrics.foreign_poses(path, estimated)
     assert told == "" if kind is None else kind in told
     # what did not move, and too few steps, say nothing
-    assert metrics.foreign_truth(np.tile(np.eye(4), (60, 1, 1)), change(true)) == ""
-    assert metrics.foreign_truth(estimated[:9], change(true)[:9]) == ""
+    assert metrics.foreign_poses(change(true), np.tile(np.eye(4), (60, 1, 1))) == ""
+    assert metrics.foreign_poses(change(true)[:9], estimated[:9]) == ""

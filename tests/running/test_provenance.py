@@ -14,9 +14,8 @@ def test_a_stage_keeps_results_of_the_same_inputs(tmp_path):
     files.write_text(folder / "result", "kept")
     assert provenance.stage(tmp_path / "a", size=3, data="one") == folder
     assert (folder / "result").exists()
-    before = provenance.made_from(folder)
     provenance.stage(tmp_path / "a", data="other", size=3)
-    assert not (folder / "result").exists() and provenance.made_from(folder) != before
+    assert not (folder / "result").exists()
     with pytest.raises(InputError, match="a: .*size"):
         provenance.stage(folder, replace=False, data="other", size=4)
     assert provenance.record(folder) == {"data": "other", "size": 3}

@@ -120,8 +120,8 @@ def odometry(options: Any) -> None:
     steps = len(sequence), result.failed_steps, result.dropped_steps
     _warn(checks.run_warnings(sequence.name, *steps, settings.scale_gate))
     if sequence.has_truth:
-        reason = metrics.foreign_truth(result.poses, sequence.poses)
-        _warn([f"{sequence.poses_path}: {reason}"] * bool(reason))
+        reason = metrics.foreign_poses(sequence.poses, result.poses)
+        _warn([f"{sequence.poses_path}: true {reason}"] * bool(reason))
     record = _record(result, sequence)
     if options.plot:
         truth, poses = None, result.poses
@@ -343,8 +343,9 @@ def _check_masks(sequence: Any, mask_sets: Iterable) -> list[str]:
     warnings = checks.sequence_warnings(sequence)
     for masks in mask_sets:
         with suppress(InputError):  # a file that cannot be read is reported when it is used
-            program.log.info(checks.describe_masks(masks, sequence))
-            warnings += checks.mask_warnings(masks)
+            line, of_masks = checks.look_at_masks(masks, sequence)
+            program.log.info(line)
+            warnings += of_masks
     return warnings
 
 

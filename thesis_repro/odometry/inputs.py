@@ -27,7 +27,7 @@ def camera_matrix(intrinsics: Any) -> np.ndarray:
     return matrix
 
 
-def start_pose(start: Any) -> np.ndarray:
+def first_pose(start: Any) -> np.ndarray:
     """Return the pose of the first frame, 4x4 (None: the identity), or raise InputError."""
     if start is None:
         return np.eye(4)

@@ -155,7 +155,7 @@ class Odometry:
         if settings.detector and self.calls.detect is detect:
             self.calls = self.calls._replace(detect=settings.detector)
         self.estimator: Estimator = (settings.estimator or VoteOfAll)(self.calls)
-        self.pose = inputs.start_pose(start)
+        self.pose = inputs.first_pose(start)
         self.count = 0  # of frames so far
         self.previous: np.ndarray | None = None  # the last frame that was not skipped
         self.points = NO_POINTS  # in it

@@ -228,10 +228,11 @@ UNKNOWN = "do not fit these frames, or the odometry fails on them"
 def foreign_poses(poses: np.ndarray, reference: np.ndarray) -> str:
     """Return what poses of another convention than the camera's most likely are, or an empty text.
 
-    poses, reference: paths, (n, 4, 4), of the same frames; the second ones are right. No
-    working odometry is off by FOREIGN_DIRECTION degrees in the median direction of its steps, and
-    no one of CONVENTIONS leaves less than BETTER of the product of right poses' errors in direction
-    and rotation. Only steps of MIN_DIRECTED_STEP or more count.
+    poses, reference: paths, (n, 4, 4), of the same frames. The second ones are right, or they are
+    an estimate and the first ones the ground truth. No working odometry is off by FOREIGN_DIRECTION
+    degrees in the median direction of its steps, and no one of CONVENTIONS leaves less than BETTER
+    of the product of right poses' errors in direction and rotation. Only steps of MIN_DIRECTED_STEP
+    or more count.
     """
     given = _misfit(poses, reference)
     kind, limits, product = "", given, BETTER * given.prod()  # NaN for too few steps
@@ -255,15 +256,6 @@ def foreign_poses(poses: np.ndarray, reference: np.ndarray) -> str:
         f"steps point {given[0]:.0f} degrees (median) elsewhere and turn by {given[1]:.2g} (mean) otherwise, "
         f"so these poses most likely {kind}"
     )
-
-
-def foreign_truth(estimated: np.ndarray, true: np.ndarray) -> str:
-    """Return what is wrong with true poses that cannot be those of the camera, or an empty text.
-
-    estimated, true: (n, 4, 4) each. See `foreign_poses`.
-    """
-    reason = foreign_poses(true, estimated)
-    return f"true {reason}" if reason else ""
 
 
 def _steps_to_compare(poses: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -105,7 +105,7 @@ def run(
     rows, steps = [], []
     for index in progress(range(len(sequence)), description):
         frame = sequence.frame(index)
-        mask, mask_seconds = _masks_of_frame(sequence, index, [masks])[id(masks)]
+        mask, mask_seconds = _mask_of_frame(masks, index, sequence.visible(index))
         step = odometry.step(frame, step_lengths[index], mask)
         rows.append([*step.row().values(), mask_seconds])
         if keep_steps:
@@ -147,13 +147,15 @@ def run_many(
         odometries[name] = Odometry(
             sequence.intrinsics, settings, start_pose(sequence), together.calls
         )
+    distinct = {id(masks): masks for _, masks in runs.values()}
     step_lengths = sequence.scales
     rows: dict[str, list[list]] = {name: [] for name in runs}
     for index in progress(range(len(sequence)), description):
         frame = sequence.frame(index)
         frame.setflags(write=False)  # so that all runs share it
         together.expect(frame, odometries.values())
-        made = _masks_of_frame(sequence, index, [masks for _, masks in runs.values()])
+        visible = sequence.visible(index)
+        made = {key: _mask_of_frame(masks, index, visible) for key, masks in distinct.items()}
         for name, odometry in odometries.items():
             mask, mask_seconds = made[id(runs[name][1])]
             step = odometry.step(frame, step_lengths[index], mask)
@@ -162,18 +164,14 @@ def run_many(
     return {name: _result(rows[name], settings) for name, (settings, _) in runs.items()}
 
 
-def _masks_of_frame(
-    sequence: SequenceLike, index: int, masks_of_runs: list[Masks | None]
-) -> dict[int, tuple[np.ndarray | None, float]]:
-    """The mask of a frame and the seconds to make it, by the identity of the masks object."""
-    visible, made = sequence.visible(index), {}
-    for masks in masks_of_runs:
-        if id(masks) not in made:
-            started = time.perf_counter()
-            mask = None if masks is None else masks[index]
-            seconds = time.perf_counter() - started
-            made[id(masks)] = inside(visible, mask), seconds
-    return made
+def _mask_of_frame(
+    masks: Masks | None, index: int, visible: np.ndarray | None
+) -> tuple[np.ndarray | None, float]:
+    """The mask of a frame, within what is visible, and the seconds to make it."""
+    started = time.perf_counter()
+    mask = None if masks is None else masks[index]
+    seconds = time.perf_counter() - started
+    return inside(visible, mask), seconds
 
 
 def inside(visible: np.ndarray | None, mask: Any) -> Any:

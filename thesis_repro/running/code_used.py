@@ -152,17 +152,14 @@ def _defined(node: ast.AST) -> list[str]:
     """Return the names that a statement defines; "" for one that does something else."""
     if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
         return [node.name]
-    if isinstance(node, ast.Import | ast.ImportFrom):
+    is_docstring = isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
+    if is_docstring or isinstance(node, ast.Import | ast.ImportFrom):
         return []
-    if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):  # a docstring
-        return []
-    stored = []
-    if isinstance(node, ast.Assign | ast.AnnAssign | ast.AugAssign):
-        targets = node.targets if isinstance(node, ast.Assign) else [node.target]
-        parts = [part for target in targets for part in ast.walk(target)]
-        names = [part for part in parts if isinstance(part, ast.Name)]
-        stored = [part.id for part in names if isinstance(part.ctx, ast.Store)]
-    return stored or [""]
+    if not isinstance(node, ast.Assign | ast.AnnAssign | ast.AugAssign):
+        return [""]
+    targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+    parts = [part for target in targets for part in ast.walk(target) if isinstance(part, ast.Name)]
+    return [part.id for part in parts if isinstance(part.ctx, ast.Store)] or [""]
 
 
 def _imported(node: ast.AST) -> dict[str, Place]:

@@ -20,8 +20,6 @@ from thesis_repro.running import program
 
 # matches the names that `temporary_path` returns
 TEMPORARY = re.compile(r"\..*\.thesis-repro-[0-9a-f]{8}(\..*)?")
-# what a system puts into a folder of its own accord: Finder, NFS, a new disk
-OF_SYSTEM = re.compile(r"\.DS_Store|\._.*|\.nfs.*|lost\+found")
 DELAY = 1  # seconds before a progress bar appears
 
 
@@ -83,11 +81,6 @@ def _decoded(path: str | Path, flag: int, largest: type = np.uint8) -> np.ndarra
 def listed(folder: str | Path, pattern: str = "*.png") -> list[Path]:
     """Return the files of a folder that match a pattern, in sorted order, without hidden ones."""
     return sorted(path for path in Path(folder).glob(pattern) if not path.name.startswith("."))
-
-
-def is_of_system(path: Path) -> bool:
-    """Return whether nobody put a file there: a folder with such files alone counts as empty."""
-    return bool(OF_SYSTEM.fullmatch(path.name))
 
 
 def images(folder: str | Path) -> list[Path]:

@@ -9,6 +9,7 @@ import hashlib
 import json
 import os
 import platform
+import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from importlib import metadata
@@ -20,10 +21,13 @@ import pandas as pd
 
 from thesis_repro.errors import InputError
 from thesis_repro.running import program
-from thesis_repro.running.files import TEMPORARY, is_of_system, progress, write_text
+from thesis_repro.running.files import TEMPORARY, progress, write_text
 
 ROOT = Path(__file__).resolve().parents[2]  # holds the packages
 RECORD = "made-from.json"  # in the folder of a stage
+# What a system puts into a folder of its own accord: Finder, NFS, a new disk. A folder with such
+# files alone counts as empty.
+OF_SYSTEM = re.compile(r"\.DS_Store|\._.*|\.nfs.*|lost\+found")
 
 
 def stage(folder: str | Path, *, replace: Any = True, **inputs: Any) -> Path:
@@ -39,7 +43,7 @@ def stage(folder: str | Path, *, replace: Any = True, **inputs: Any) -> Path:
         inputs = json.loads(json.dumps(inputs, default=str))
         earlier = record(folder)
         sweep(folder)
-        if earlier is None and not all(map(is_of_system, folder.iterdir())):
+        if earlier is None and not all(OF_SYSTEM.fullmatch(path.name) for path in folder.iterdir()):
             raise InputError(
                 f"{folder}: holds files that this project did not make; choose an empty or new folder"
             )
@@ -85,11 +89,6 @@ def record(folder: str | Path) -> Any:
         return dict(json.loads(path.read_text(encoding="utf-8")))
     except (ValueError, TypeError):
         raise InputError(f"{path}: is damaged; delete its folder") from None
-
-
-def made_from(folder: str | Path) -> str:
-    """Return a digest of the inputs of the results in a stage's folder."""
-    return digest_of_file(Path(folder) / RECORD)
 
 
 def sweep(folder: str | Path) -> None:

@@ -53,17 +53,10 @@ def smaller_rotation(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def fit(rotation: np.ndarray, translation: np.ndarray, matches: Matches) -> RefinedMotion:
     """Motion refined from a start, with its uncertainty.
 
-    See `refine` for the arguments. The start's unit translation may have either sign (see
-    `with_uncertainty`).
+    See `refine` for the arguments. The start's unit translation may have either sign: the points
+    near the motion vote on it (`cheirality_votes`).
     """
-    return with_uncertainty(*refine(rotation, translation, matches), matches)
-
-
-def with_uncertainty(rotation: np.ndarray, heading: np.ndarray, matches: Matches) -> RefinedMotion:
-    """The same motion with its uncertainty.
-
-    The points near the motion vote on the sign of its heading (`cheirality_votes`).
-    """
+    rotation, heading = refine(rotation, translation, matches)
     threshold = matches.threshold
     support = _support(rotation, heading, columns(matches), threshold)
     forward, backward = cheirality_votes(rotation, heading, support, threshold)
