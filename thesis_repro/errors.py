@@ -2,7 +2,6 @@
 
 from importlib.util import find_spec
 from traceback import walk_tb
-from typing import Any
 
 # compiled packages that every command needs, and what installs them; any OpenCV will do
 COMPILED = {"cv2": "opencv-python-headless", "numpy": "numpy"}
@@ -62,12 +61,10 @@ def cause(error: Exception) -> str:
     return f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
 
 
-def need(name: str, value: object, kind: Any) -> None:
-    """Raise InputError unless an argument of a public function is of a kind: a type, or "A | B"."""
+def need(name: str, value: object, kind: type) -> None:
+    """Raise InputError unless an argument of a public function is of a type."""
     if not isinstance(value, kind):
-        raise InputError(
-            f"{name}: must be {getattr(kind, '__name__', kind)}, not {type(value).__name__}"
-        )
+        raise InputError(f"{name}: must be {kind.__name__}, not {type(value).__name__}")
 
 
 def missing_package(error: ImportError | AttributeError) -> InputError | None:

@@ -97,21 +97,20 @@ class Sequence:
         self.name, self.speed = self.folder.name, speed
         self.border: np.ndarray | None = None  # see `without_border`
         files = layout.files(self.folder, camera)
-        self.frame_paths, self.doubts, self._others = files.frames, files.doubts, files.others
-        read_camera, self.calibration_path = files.read_camera, files.calibration
         if calibration is not None:
-            read_camera, self.calibration_path = cameras.read_camera, Path(calibration)
-        lens = read_camera(self.calibration_path)
+            files = files._replace(read_camera=cameras.read_camera, calibration=Path(calibration))
+        if truth is not None:
+            files = files._replace(read_poses=read_truth, poses=Path(truth))
+        self.frame_paths, self.doubts, self._others = files.frames, files.doubts, files.others
+        self.calibration_path = files.calibration
+        self.times_path, self.poses_path = files.times, files.poses
+        lens = files.read_camera(self.calibration_path)
         self.intrinsics, self.distortion, self.stated_size = lens[:3]
-        self.times_path = files.times
         self.has_times = self.times_path.exists()
         self.times = self._read_times(files.read_times, fps)
-        read_poses, self.poses_path = files.read_poses, files.poses
-        if truth is not None:
-            read_poses, self.poses_path = read_truth, Path(truth)
         self.has_truth = truth is not None or self.poses_path.exists()
         if self.has_truth:
-            indices, poses = read_poses(self.poses_path, self.times)
+            indices, poses = files.read_poses(self.poses_path, self.times)
             self._take_truth(indices, poses, lens.body)
         if speed is not None:
             self._check_speed(speed, self.has_times or fps is not None)
