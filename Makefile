@@ -97,7 +97,7 @@ $(RUN)/notebooks/%.ipynb: $(RUN)/code/% $(RUN)/checked
 	&& mv $(@D)/.$*.ipynb $@ && echo "$*: done in $$SECONDS s" \
 	|| { echo "$* failed: $$($(call reason,$(@:.ipynb=.log))) ($(@:.ipynb=.log))" >&2; exit 1; }
 # The last line of a log is the error, but not if the kernel died: then it is what the kernel said, or else memory ran out.
-reason = tr -d '\033' <$(1) | sed 's/\[[0-9;]*m//g' | awk '/^F[0-9]|^Fatal Python error|what\(\):/ {said = $$0} NF {last = $$0} \
+reason = tr -d '\033' <$(1) | sed 's/\[[0-9;]*m//g' | awk '/^F[0-9]|^Fatal Python error|what\(\):/ && !said {said = $$0} NF {last = $$0} \
   END {print last !~ /DeadKernelError/ ? last : said ? said : "its kernel was killed, most likely because memory ran out"}'
 $(RUN)/checked $(NAMES:%=$(RUN)/code/%): ;
 # Render the drives of the embedded world and compile the shared odometry while the network is trained, to save time.

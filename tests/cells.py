@@ -1,6 +1,7 @@
-"""The cells of the notebooks in git."""
+"""The cells of the notebooks in git, and which of them make executes."""
 
 import json
+import re
 
 from thesis.settings import ROOT
 
@@ -17,3 +18,13 @@ def cells(name, kind):
     """{id: text} of the cells of one kind, "code" or "markdown"."""
     read = json.loads((ROOT / "notebooks" / name).read_text())["cells"]
     return {cell["id"]: "".join(cell["source"]) for cell in read if cell["cell_type"] == kind}
+
+
+def code_of(name):
+    """The code of a notebook."""
+    return "\n".join(cells(name, "code").values())
+
+
+def executed_by(commands):
+    """The numbers of the notebooks that commands execute, from the output of make."""
+    return sorted(re.findall(r"--output \.(\d\d)_", commands.replace("\\\n", "")))

@@ -5,12 +5,10 @@ import re
 import sys
 
 import pytest
-from trials import ROOT, succeed
+from trials import PACKAGES, ROOT, succeed
 
 MODULES = [
-    path
-    for pattern in ("thesis_repro", "keypoint_study", "street_world", "opencv_exact", "notebooks")
-    for path in sorted((ROOT / pattern).rglob("*.py"))
+    path for folder in (*PACKAGES, "notebooks") for path in sorted((ROOT / folder).rglob("*.py"))
 ]
 
 

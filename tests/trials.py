@@ -3,6 +3,7 @@
 import fnmatch
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -18,6 +19,7 @@ from thesis.settings import ROOT
 from thesis_repro.running import files
 from thesis_repro.segmentation import ARITHMETIC
 
+PACKAGES = "thesis_repro", "keypoint_study", "street_world", "opencv_exact"
 # what thesis_repro.segmentation has set in this process
 SET_BY_TESTS = {"SM_FRAMEWORK", "NO_ALBUMENTATIONS_UPDATE", "TF_CPP_MIN_LOG_LEVEL", *ARITHMETIC}
 
@@ -29,6 +31,16 @@ class Result(NamedTuple):
     stdout: str
     stderr: str
     left: list = ()
+
+
+def copy_project(names, root):
+    """Copy folders and files of the project into a folder."""
+    for name in names:
+        if (ROOT / name).is_dir():
+            compiled = shutil.ignore_patterns("__pycache__")
+            shutil.copytree(ROOT / name, root / name, ignore=compiled)
+        else:
+            shutil.copy(ROOT / name, root)
 
 
 def thesis(*words):

@@ -46,9 +46,10 @@ def _execute(settings: Settings) -> int:
     at_once = [] if settings.jobs == 1 else ["-j2"]
     folder = os.path.relpath(settings.build, ROOT)
     command = [os.environ.get("MAKE", "make"), "-k", *at_once, "notebooks", f"RUN={folder}"]
-    # bars inside notebooks go to the terminal
+    # bars inside notebooks go to the terminal; a kernel that crashes says how
     terminal = os.ttyname(2) if sys.stderr.isatty() else os.devnull
     variables = {"IPYTHONDIR": str(ipython.resolve()), "THESIS_REPRO_PROGRESS": terminal}
+    variables["PYTHONFAULTHANDLER"] = "1"
     process = subprocess.Popen(command, cwd=ROOT, env=os.environ | variables)
     try:
         return process.wait()

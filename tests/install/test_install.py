@@ -2,7 +2,6 @@
 
 import os
 import re
-import shutil
 import subprocess
 import sys
 import tomllib
@@ -11,7 +10,7 @@ from pathlib import Path
 
 import pytest
 from packaging.requirements import Requirement
-from trials import refused, run, snapshot, succeed
+from trials import PACKAGES, copy_project, refused, run, snapshot, succeed
 
 import can_install
 import installed as installed_packages
@@ -43,10 +42,7 @@ def uv(*words):
 def wheel(tmp_path_factory):
     """It is built from a copy, because building leaves files beside what it is built from."""
     folder = tmp_path_factory.mktemp("source")
-    for name in ("thesis_repro", "keypoint_study", "street_world", "opencv_exact"):
-        shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
-    for name in ("pyproject.toml", "LICENSE"):
-        shutil.copy(ROOT / name, folder)
+    copy_project([*PACKAGES, "pyproject.toml", "LICENSE"], folder)
     build = ("build", "--wheel", "--no-build-isolation", "--python", sys.executable)
     uv(*build, "--out-dir", folder / "dist", folder)
     return next((folder / "dist").glob("*.whl"))
@@ -129,16 +125,8 @@ def plan(root, *options, **changes):
 @pytest.fixture
 def checkout(tmp_path):
     """A folder with the Makefile, and an environment that make takes for its own."""
-    for name in ("Makefile", "environment.txt", "pyproject.toml"):
-        shutil.copy(ROOT / name, tmp_path)
-    for name in (
-        "thesis_repro",
-        "keypoint_study",
-        "street_world",
-        "opencv_exact",
-        "notebooks",
-        "tools",
-    ):
+    copy_project(["Makefile", "environment.txt", "pyproject.toml"], tmp_path)
+    for name in (*PACKAGES, "notebooks", "tools"):
         (tmp_path / name).symlink_to(ROOT / name)
     (tmp_path / ".venv").symlink_to(sys.prefix)
     return tmp_path

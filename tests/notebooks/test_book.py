@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from bs4 import BeautifulSoup
-from cells import NOTEBOOKS, cells
+from cells import NOTEBOOKS, cells, code_of
 from executing import run_of
 
 from thesis import book, gallery
@@ -64,8 +64,7 @@ def test_each_picture_of_a_lesson_has_words_that_say_what_is_to_be_seen(pages, n
 
 @pytest.mark.parametrize("name", NOTEBOOKS)
 def test_lines_of_code_fit_into_a_page_of_1280_pixels(name):
-    lines = "\n".join(cells(name, "code").values()).split("\n")
-    assert [line for line in lines if len(line) > 100] == []
+    assert [line for line in code_of(name).split("\n") if len(line) > 100] == []
 
 
 def test_only_what_changed_is_read_again(pages, settings):

@@ -2,12 +2,12 @@
 
 import os
 import re
-import shutil
 import subprocess
 
 import nbformat
 import pytest
-from cells import NOTEBOOKS, named
+from cells import NOTEBOOKS, executed_by, named
+from trials import PACKAGES, copy_project
 
 from thesis.settings import PREFIX, ROOT
 
@@ -22,8 +22,6 @@ TABLES = ["table_3_1", "table_3_2", "table_4_1", "table_4_2", "table_4_3"]
 WITHOUT_DATA = {*(f"figure_2_{n:02d}" for n in (1, 3, 4, 5, 6, 7)), "figure_3_04", "figure_a_01"}
 # a call that saves a figure, at the start of a line
 SAVED = re.compile(r"^\w+\.save_figure\(", re.MULTILINE)
-# the number of a notebook in a command that executes it, in the output of make
-EXECUTED = re.compile(r"--output \.(\d\d)_")
 
 
 def make_figures(tmp_path, *options, root=ROOT, target="figures"):
@@ -101,12 +99,9 @@ def test_sliders_show_the_numbers_of_the_cells_above_after_all_cells(executed, n
 def test_a_failing_notebook_does_not_stop_the_others(tmp_path):
     """On a copy of the project with small notebooks; copies beside the nine are left alone."""
     root = tmp_path / "project"
-    packages = "thesis_repro", "keypoint_study", "opencv_exact", "street_world"
-    for folder in (*packages, "notebooks/thesis", "tools", "docs"):
-        shutil.copytree(ROOT / folder, root / folder, ignore=shutil.ignore_patterns("__pycache__"))
+    copy_project([*PACKAGES, "notebooks/thesis", "tools", "docs"], root)
+    copy_project(["Makefile", "environment.txt", "pyproject.toml"], root)
     (root / ".venv").symlink_to(ROOT / ".venv")
-    for name in ("Makefile", "environment.txt", "pyproject.toml"):
-        shutil.copy(ROOT / name, root)
     codes = dict.fromkeys(NOTEBOOKS, "print('by hand')")
     codes["02_augmentation.ipynb"] = "raise ValueError('labels: missing')"
     codes["03_unet.ipynb"] = "import os; os.abort()"
@@ -132,14 +127,7 @@ def test_real_frames_alone_need_no_training(tmp_path, tiny_kitti):
     options = f"KITTI={tiny_kitti}", f"RUN={tmp_path / 'run'}", "-n"
     planned = make_figures(tmp_path, *options, target="notebooks")
     assert planned.returncode == 0, planned.stderr
-    assert EXECUTED.findall(planned.stdout.replace("\\\n", "")) == [
-        "03",
-        "05",
-        "06",
-        "07",
-        "08",
-        "09",
-    ]
+    assert executed_by(planned.stdout) == ["03", "05", "06", "07", "08", "09"]
 
 
 def test_bad_data_stops_before_the_notebooks(tmp_path, tiny_kitti):

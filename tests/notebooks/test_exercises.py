@@ -5,7 +5,10 @@ maps. What holds only in the lab is marked torture.
 """
 
 import json
+import operator
 import re
+from contextlib import redirect_stdout
+from io import StringIO
 
 import cv2
 import matplotlib.pyplot as plt
@@ -35,18 +38,133 @@ CHOICES = "01 02 03 04 23 52 43 54 55"
 TEXT = "aligned ATE (m)"
 CROSS_ENTROPY = "other_loss = keras.losses.CategoricalCrossentropy()"
 ALL_SEQUENCES = "kitti.sequences(settings.kitti)"
+WINDOW_OF_5 = "WINDOW = 21 ", "WINDOW = 5 "
+SKY = "classes=(),", 'classes=("sky",),'
 ROTATION = "rotation error (°/frame)"
 
 
 def run(number, ids, *edits, **names):
-    """The names that cells of a notebook leave; edits: pairs of an old and a new text."""
+    """The names that cells of a notebook leave, and "printed", what they print.
+
+    edits: pairs of an old and a new text.
+    """
     by_id = cells(named(number), "code")
     text = "\n\n".join(by_id[f"{number}-{each}"] for each in ids.split())
     for old, new in edits:
         assert text.count(old) == 1, old
         text = text.replace(old, new)
-    exec(re.sub("(?m)^%", "#", text), names)
-    return names
+    with redirect_stdout(StringIO()) as printed:
+        exec(re.sub("(?m)^%", "#", text), names)
+    return names | {"printed": printed.getvalue()}
+
+
+def parameters(names):
+    return names["model"].count_params()
+
+
+def agreeing_rows(names):
+    return names["table"]["as printed"].sum()
+
+
+def fall_of_loss(names):
+    losses = names["history1"].history["loss"]
+    return losses[0] - losses[-1]
+
+
+# exercise: (cells, an old and a new text, what is looked at, what holds of it before and after)
+BEFORE_AND_AFTER = {
+    "01_1": (
+        READING,
+        ("LABEL_RESIZING = cv2.INTER_NEAREST", "LABEL_RESIZING = cv2.INTER_LINEAR"),
+        lambda names: set(np.unique(names["labels"])),
+        operator.lt,
+    ),
+    "01_3": (
+        READING,
+        ("VALIDATION_SHARE = 0.2", "VALIDATION_SHARE = 0.5"),
+        lambda names: len(names["validation_images"]),
+        operator.lt,
+    ),
+    "01_3, what Figure 3.5 counts": (
+        READING,
+        ("VALIDATION_SHARE = 0.2", "VALIDATION_SHARE = 0.5"),
+        lambda names: names["labels"].tolist(),
+        operator.eq,
+    ),
+    "02_1": (
+        TRANSFORMS,
+        ("A.HorizontalFlip(p=0.5)", "A.VerticalFlip(p=0.5)"),
+        lambda names: "EDITED" in names["printed"],
+        operator.lt,
+    ),
+    "03_1": (
+        NETWORK,
+        ("DEPTH = 4 ", "DEPTH = 3 "),
+        parameters,
+        lambda usual, edited: edited == pytest.approx(0.25 * usual, rel=0.1),
+    ),
+    "03_1, Figure A.1": (
+        f"{NETWORK} 21",
+        ("DEPTH = 4 ", "DEPTH = 3 "),
+        agreeing_rows,
+        lambda usual, edited: edited < usual == 41,
+    ),
+    "03_2": (
+        NETWORK,
+        ("CORRECTED_BLOCKS = False", "CORRECTED_BLOCKS = True"),
+        parameters,
+        lambda usual, edited: edited == pytest.approx(2 * usual, rel=0.1),
+    ),
+    "04_3": (
+        LOSS,
+        ("LEARNING_RATE = settings.sizes.learning_rate", "LEARNING_RATE = 0.00001"),
+        fall_of_loss,
+        lambda usual, edited: 0 < edited < usual / 4,
+    ),
+}
+# exercise: (an old and a new text, what masks.json holds beside the width of 10, what holds of the
+# reader's row of the last table of notebook 6 as a ratio to the thesis's)
+YOUR_MASKS = {
+    "06_1": (
+        ("CANNY = (5, 15)", "CANNY = (1, 3)"),
+        {"canny": [1, 3]},
+        lambda row: row["coverage (%)"] > 1.05 and row["keypoints"] > 1,
+    ),
+    "06_2": (
+        SKY,
+        {"classes": ["sky"]},
+        lambda row: row["keypoints"] < 0.25 and row[ROTATION] > 1,
+    ),
+    "06_3": (
+        ("WIDTH = 10 ", "WIDTH = 3 "),
+        {"width": 3},
+        lambda row: row["coverage (%)"] < row["keypoints"] < 1,
+    ),
+    "06_3, inverse": (
+        ('keep="boundaries"', 'keep="inverse"'),
+        {"keep": "inverse"},
+        lambda row: row["keypoints"] > 1,
+    ),
+    "06_4": (
+        ("dilate(edge_image, kernel)", "dilate(edge_image, kernel, None, None, 2)"),
+        {},
+        lambda row: row["coverage (%)"] > 1.2,
+    ),
+}
+# the same of notebook 7, and whether its cell prints EDITED
+YOUR_LOOP = {
+    "07_2": (WINDOW_OF_5, False, lambda row: row["tracked (%)"] < 0.95),
+    "07_4": (
+        ('"maxLevel": 3', '"maxLevel": 0'),
+        True,
+        lambda row: row["tracked (%)"] > 1 and row[ROTATION] > 5,
+    ),
+    "07_4, the position": (
+        ("position + scales[number]", "position + 2 * scales[number]"),
+        True,
+        lambda row: row[TEXT] > 10,
+    ),
+}
 
 
 @pytest.fixture
@@ -87,14 +205,19 @@ def test_every_exercise_has_a_test():
         (text,) = (each for each in cells(name, "markdown").values() if "## Exercises" in each)
         questions = text.partition("## Exercises")[2].partition("<details")[0]
         asked |= {(name[:2], number) for number in re.findall(r"(?m)^(\d)\. ", questions)}
-    tested = re.findall(r"(?<=_)(\d\d)_(\d)", " ".join(filter(re.compile("test").match, globals())))
+    tests = filter(re.compile("test").match, globals())
+    tables = (*BEFORE_AND_AFTER, *YOUR_MASKS, *YOUR_LOOP)
+    tested = re.findall(r"(?:\b|(?<=_))(\d\d)_(\d)", " ".join([*tests, *tables]))
     assert asked == set(tested)
 
 
-def test_exercise_01_1(build):
-    linear = "LABEL_RESIZING = cv2.INTER_NEAREST", "LABEL_RESIZING = cv2.INTER_LINEAR"
-    usual, new = (set(np.unique(run("01", READING, *edit)["labels"])) for edit in ((), [linear]))
-    assert usual < new
+@pytest.mark.parametrize("exercise", BEFORE_AND_AFTER)
+def test_an_edit_has_the_promised_effect(exercise, request):
+    number = exercise[:2]
+    request.getfixturevalue({"02": "images", "04": "networks"}.get(number, "build"))
+    ids, edit, look, holds = BEFORE_AND_AFTER[exercise]
+    usual, edited = look(run(number, ids)), look(run(number, ids, edit))
+    assert holds(usual, edited)
 
 
 def test_exercise_01_2(build):
@@ -112,20 +235,6 @@ def test_exercise_01_2(build):
         training.check_images(names["train_images"], (None, 64, 64, 1))
 
 
-def test_exercise_01_3(build):
-    half = "VALIDATION_SHARE = 0.2", "VALIDATION_SHARE = 0.5"
-    usual, edited = run("01", READING), run("01", READING, half)
-    assert np.array_equal(usual["labels"], edited["labels"])  # what Figure 3.5 counts
-    assert len(edited["validation_images"]) > len(usual["validation_images"])
-
-
-def test_exercise_02_1(images, capsys):
-    run("02", TRANSFORMS)
-    assert "EDITED" not in capsys.readouterr().out
-    run("02", TRANSFORMS, ("A.HorizontalFlip(p=0.5)", "A.VerticalFlip(p=0.5)"))
-    assert "EDITED" in capsys.readouterr().out
-
-
 def test_exercise_02_2(images):
     written = []
     full = "FULL_VALIDATION_AUGMENTATION = False", "FULL_VALIDATION_AUGMENTATION = True"
@@ -137,19 +246,10 @@ def test_exercise_02_2(images):
     assert same == {"doubled_train_images", "doubled_train_labels"}
 
 
-def test_exercise_02_3(images, capsys):
-    run("02", f"{TRANSFORMS} 15 27", ("SEEDS_COMPARED = 20 ", "SEEDS_COMPARED = 200 "))
-    assert re.search(r"(?m)^0 of [\d,]+ values differ over 200 seeds", capsys.readouterr().out)
-
-
-def test_exercises_03_1_and_03_2(build):
-    usual = run("03", f"{NETWORK} 21")
-    shallow = run("03", f"{NETWORK} 21", ("DEPTH = 4 ", "DEPTH = 3 "))
-    ratio = shallow["model"].count_params() / usual["model"].count_params()
-    assert ratio == pytest.approx(0.25, rel=0.1)
-    assert shallow["table"]["as printed"].sum() < usual["table"]["as printed"].sum() == 41
-    both = run("03", NETWORK, ("CORRECTED_BLOCKS = False", "CORRECTED_BLOCKS = True"))["model"]
-    assert both.count_params() == pytest.approx(2 * usual["model"].count_params(), rel=0.1)
+def test_exercise_02_3(images):
+    edit = "SEEDS_COMPARED = 20 ", "SEEDS_COMPARED = 200 "
+    printed = run("02", f"{TRANSFORMS} 15 27", edit)["printed"]
+    assert re.search(r"(?m)^0 of [\d,]+ values differ over 200 seeds", printed)
 
 
 def test_exercise_03_3(build):
@@ -157,13 +257,10 @@ def test_exercise_03_3(build):
         run("03", NETWORK, ("SIZE = settings.sizes.image_size", "SIZE = 100"))
 
 
-def test_exercises_04_2_and_04_3(networks):
+def test_exercise_04_2(networks):
     same = run("04", LOSSES, (CROSS_ENTROPY, "other_loss = total_loss"))
     assert same["history1"].history == same["history2"].history
     assert same["scores"]["total_loss"] == same["scores"]["other_loss"]
-    rate = "LEARNING_RATE = settings.sizes.learning_rate", "LEARNING_RATE = 0.00001"
-    usual, slow = (names["history1"].history["loss"] for names in (same, run("04", LOSS, rate)))
-    assert 0 < slow[0] - slow[-1] < (usual[0] - usual[-1]) / 4
 
 
 @pytest.mark.torture
@@ -181,13 +278,13 @@ def test_exercise_04_1(tmp_path, monkeypatch):
     assert ahead == ["other_loss", "total_loss", "total_loss"]
 
 
-def test_exercise_05_1(build, capsys):
+def test_exercise_05_1(build):
     _, labels = cityscapes.load(cityscapes.pairs(read_settings().cityscapes, "val"), 64)
     moved = []
     for name in ("building", "traffic sign", "pole"):
         label = cityscapes.LABELS[cityscapes.ID[name]]
-        run("05", "56", np=np, test_labels=labels, label=label)
-        moved.append(float(re.search(r"IoU ([\d.]+)", capsys.readouterr().out)[1]))
+        printed = run("05", "56", np=np, test_labels=labels, label=label)["printed"]
+        moved.append(float(re.search(r"IoU ([\d.]+)", printed)[1]))
     building, sign, pole = moved
     assert building > 0.7 > 1.5 * sign and sign > pole
 
@@ -211,40 +308,24 @@ def test_exercise_05_2(executed, small_world, monkeypatch, tmp_path):
     assert kept[1] > 1.2 * kept[0]
 
 
-def last_rows(*edits):
-    """The last table of notebook 6: the thesis's row, and the reader's."""
-    rows = run("06", MASKS, *edits)["rows"]
-    thesis, yours = pd.DataFrame(rows).T.iloc
-    return thesis, yours
+def rows_of(number, ids, *edits):
+    """The thesis's row and the reader's in the last table of a notebook, and what it prints."""
+    names = run(number, ids, *edits)
+    thesis, yours = pd.DataFrame(names["rows"]).T.iloc
+    return thesis, yours, names["printed"]
 
 
-def test_exercises_06_1_06_2_06_3_06_4(build, capsys):
-    thesis, yours = last_rows()
+def test_your_masks_stand_beside_the_thesiss(build):
+    thesis, yours, printed = rows_of("06", MASKS)
     assert thesis.equals(yours) and thesis["keypoints"] > 100
+    assert "to the bit: True" in printed and "EDITED" not in printed
     assert json.loads((build / "masks.json").read_text()) == {"width": 10}
-    assert "to the bit: True" in capsys.readouterr().out
-    wide, narrow = ("CANNY = (5, 15)", "CANNY = (1, 3)"), ("WIDTH = 10 ", "WIDTH = 3 ")
-    sky = "classes=(),", 'classes=("sky",),'
-    inverse = 'keep="boundaries"', 'keep="inverse"'
-    twice = "dilate(edge_image, kernel)", "dilate(edge_image, kernel, None, None, 2)"
-    edited = {}
-    for edit in (wide, narrow, sky, inverse, twice):
-        first, second = last_rows(edit)
-        assert first.equals(thesis)
-        edited[edit] = second / thesis
-        assert ("EDITED" in capsys.readouterr().out) == (edit == twice)
-        settings = json.loads((build / "masks.json").read_text())
-        assert settings == {"width": 3 if edit == narrow else 10} | {
-            wide: {"canny": [1, 3]},
-            sky: {"classes": ["sky"]},
-            inverse: {"keep": "inverse"},
-        }.get(edit, {})
-    changed = pd.DataFrame(edited)
-    coverage, keypoints = changed.loc["coverage (%)"], changed.loc["keypoints"]
-    assert coverage[wide] > 1.05 and keypoints[wide] > 1
-    assert keypoints[sky] < 0.25 and changed.loc[ROTATION, sky] > 1
-    assert coverage[narrow] < keypoints[narrow] < 1 < keypoints[inverse]
-    assert coverage[twice] > 1.2
+    for exercise, (edit, settings, holds) in YOUR_MASKS.items():
+        first, yours, printed = rows_of("06", MASKS, edit)
+        assert first.equals(thesis) and holds(yours / thesis), exercise
+        assert ("EDITED" in printed) == (settings == {}), exercise
+        written = json.loads((build / "masks.json").read_text())
+        assert written == {"width": 10} | settings, exercise
 
 
 def test_answers_run_when_somebody_asks_for_them(build):
@@ -266,29 +347,19 @@ def test_notebook_6_can_be_opened_first_and_7_says_what_to_run(build):
         run("07", "01 02 03 04 06")
 
 
-def loop(*edits):
-    """The last table of notebook 7: the thesis's row, and the reader's."""
-    thesis, yours = pd.DataFrame(run("07", LOOP, *edits)["rows"]).T.iloc
-    return thesis, yours
-
-
-def test_exercises_07_2_and_07_4(build, capsys):
+def test_your_loop_stands_beside_the_thesiss(build):
     run("06", MASKS)
-    thesis, yours = loop()
+    thesis, yours, printed = rows_of("07", LOOP)
     assert thesis.round(9).equals(yours.round(9)) and thesis["keypoints"] > 1000
-    out = capsys.readouterr().out
-    assert "EDITED" not in out and "masks: {'width': 10}" in out and "not the thesis's" not in out
-    first, small = loop(("WINDOW = 21 ", "WINDOW = 5 "))
-    assert first.equals(thesis) and "EDITED" not in capsys.readouterr().out
-    assert small["tracked (%)"] < 0.95 * thesis["tracked (%)"]
-    first, flat = loop(('"maxLevel": 3', '"maxLevel": 0'))
-    assert first.equals(thesis) and "EDITED" in capsys.readouterr().out
-    assert flat["tracked (%)"] > thesis["tracked (%)"] and flat[ROTATION] > 5 * thesis[ROTATION]
-    double = "position + scales[number]", "position + 2 * scales[number]"
-    assert loop(double)[1][TEXT] > 10 * thesis[TEXT]
-    run("06", MASKS, ("WIDTH = 10 ", "WIDTH = 3 "))
-    run("07", "01 02 03 04 06")
-    assert "masks: {'width': 3} (not the thesis's" in capsys.readouterr().out
+    assert "masks: {'width': 10}" in printed and "not the thesis's" not in printed
+    assert "EDITED" not in printed
+    for exercise, (edit, is_marked, holds) in YOUR_LOOP.items():
+        first, yours, printed = rows_of("07", LOOP, edit)
+        assert first.equals(thesis) and holds(yours / thesis), exercise
+        assert ("EDITED" in printed) == is_marked, exercise
+    run("06", MASKS, YOUR_MASKS["06_3"][0])
+    printed = run("07", "01 02 03 04 06")["printed"]
+    assert "masks: {'width': 3} (not the thesis's" in printed
 
 
 def ranges(*edits):
@@ -313,13 +384,13 @@ def test_exercises_07_1_and_07_3(build):
 def test_errors_of_the_lab_that_exercises_06_2_07_1_and_07_2_promise(tmp_path, monkeypatch):
     monkeypatch.setenv(PREFIX + "PROFILE", "lab")
     monkeypatch.setenv(PREFIX + "BUILD", str(tmp_path))
-    thesis, sky = last_rows(("classes=(),", 'classes=("sky",),'))  # as if opened first
+    thesis, sky, _ = rows_of("06", MASKS, SKY)  # as if opened first
     assert sky["keypoints"] < 0.3 * thesis["keypoints"] and sky[ROTATION] > 3 * thesis[ROTATION]
     run("06", MASKS)
     low, high = ranges()
     assert low.loc["500 keypoints", "RMSE (m)"] < high.loc["as above", "RMSE (m)"]
     assert low.loc["500 keypoints", ROTATION] > high.loc["as above", ROTATION]
-    thesis, small = loop(("WINDOW = 21 ", "WINDOW = 5 "))
+    thesis, small, _ = rows_of("07", LOOP, WINDOW_OF_5)
     assert small[ROTATION] > 1.2 * thesis[ROTATION]
 
 
@@ -334,7 +405,7 @@ def streets():
 
 
 @pytest.mark.parametrize("metric", ["rotation", "rmse"])
-def test_exercise_08_1(streets, metric, capsys):
+def test_exercise_08_1(streets, metric):
     names = {"np": np, "pd": pd, "stats": stats, "comparisons": comparisons, "METRIC": metric}
     names = run("08", "38 39 51", runs=streets[0], **names)
     assert names["by_hand"] == pytest.approx(names["ratio"], rel=1e-9)
@@ -369,7 +440,7 @@ def test_exercise_08_4(build):
     assert sky > usual
 
 
-def test_exercise_09_1(capsys):
+def test_exercise_09_1():
     changes = audit_of_tables.CHANGES["RMSE"]
     ratio_of = run("09", "11", np=np, stats=stats)["ratio_of"]
     ends = [re.findall(r"[\d.]+", ratio_of(each))[-2:] for each in (changes, changes[changes < 0])]

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pandas as pd
 import pytest
-from cells import NOTEBOOKS, cells
+from cells import NOTEBOOKS, code_of
 
 from keypoint_study.report import style
 from thesis import captions, gallery
@@ -70,8 +70,7 @@ def test_a_long_table_is_linked(run):
 
 
 def test_each_artefact_is_saved_by_a_notebook_and_has_files_in_git():
-    code = "".join(text for name in NOTEBOOKS for text in cells(name, "code").values())
-    named = set(re.findall(r'"(\w+)"', code))
+    named = set(re.findall(r'"(\w+)"', "".join(map(code_of, NOTEBOOKS))))
     names = {artefact["name"] for artefact in ARTEFACTS if artefact["kind"] != "text"}
     assert names - named == set()
     assert {name for name in named if re.match(r"(figure|table)_\w_\d", name)} <= names

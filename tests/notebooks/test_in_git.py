@@ -8,7 +8,7 @@ from collections import Counter
 
 import nbformat
 import pytest
-from cells import NOTEBOOKS, cells
+from cells import NOTEBOOKS, cells, code_of, named
 
 from thesis.settings import ROOT
 
@@ -34,7 +34,7 @@ def test_cells_of_lessons_are_short(name):
 
 @pytest.mark.parametrize("name", NOTEBOOKS)
 def test_lessons_import_few_names_of_the_package(name):
-    code = re.sub("(?m)^%", "#", "\n".join(cells(name, "code").values()))
+    code = re.sub("(?m)^%", "#", code_of(name))
     imports = [node for node in ast.walk(ast.parse(code)) if hasattr(node, "names")]
     names = [
         each.name
@@ -73,8 +73,8 @@ def test_the_makefile_lists_the_notebooks_that_each_one_needs():
     for number in sorted(needs):  # a notebook needs only earlier ones, whose needs are complete
         needs[number] = needs[number].union(*(needs[other] for other in needs[number]))
     for name in NOTEBOOKS:
-        named = re.findall(r'"(\d\d)_\w+"', "\n".join(cells(name, "code").values()))
-        assert set(named) <= needs[name[:2]], name
+        read = re.findall(r'"(\d\d)_\w+"', code_of(name))
+        assert set(read) <= needs[name[:2]], name
 
 
 def called_names(code):
@@ -84,29 +84,21 @@ def called_names(code):
     return {getattr(function, "attr", getattr(function, "id", "")) for function in called}
 
 
-def code_of(number):
-    """The code of a notebook."""
-    (name,) = (name for name in NOTEBOOKS if name.startswith(number))
-    return "\n".join(cells(name, "code").values())
-
-
 def test_every_call_of_each_section_of_the_appendix_is_live_in_the_notebook_that_mirrors_it():
     table = (ROOT / "docs" / "appendix-calls.md").read_text()
     rows = re.findall(r"^\| (A[\d.]+) \| `([^|]*)` \| (\d\d) \| `([^|]*)` \|", table, re.MULTILINE)
     assert Counter(section for section, *_ in rows) == CALLS
-    called = {
-        number: called_names(code_of(number)) for number in ("01", "02", "03", "04", "05", "06")
-    }
+    code = {name[:2]: code_of(name) for name in NOTEBOOKS}
     for section, call, number, where in rows:
         assert number == MIRRORS.get((section, call), MIRRORS[section[:3]]), (section, call)
-        assert where in code_of(number), (section, where)  # as a reader's search finds it
+        assert where in code[number], (section, where)  # as a reader's search finds it
         names = re.findall(r"(\w+)(?=,|\(|$)", call.replace("transform(image, mask)", "compose"))
         names = [] if call.startswith("%") else [RENAMED.get(name, name) for name in names]
-        assert set(names) <= called[number], (section, call)
+        assert set(names) <= called_names(code[number]), (section, call)
 
 
 def test_what_the_copy_of_the_thesis_lacks_is_in_the_notebook_that_the_table_names():
     table = (ROOT / "docs" / "appendix-calls.md").read_text().partition("\n## ")[2]
     rows = re.findall(r"^\|[^|]*\| (\d\d) \| `([^|]*)` \|", table, re.MULTILINE)
     assert len(rows) == 7
-    assert [row for row in rows if row[1] not in code_of(row[0])] == []
+    assert [row for row in rows if row[1] not in code_of(named(row[0]))] == []

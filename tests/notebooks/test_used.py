@@ -1,26 +1,19 @@
 """Which notebooks are executed again: contents decide, not times."""
 
 import os
-import re
 import shutil
 import sys
 
 import pytest
-from cells import NOTEBOOKS
-from trials import succeed
-
-from thesis.settings import ROOT
-
-EXECUTED = re.compile(r"--output \.(\d\d)_")  # in the output of make
+from cells import NOTEBOOKS, executed_by
+from trials import PACKAGES, copy_project, succeed
 
 
 @pytest.fixture(scope="module")
 def project(tmp_path_factory):
     """A copy of the code with `run`, in which every notebook was executed."""
     root = tmp_path_factory.mktemp("project")
-    for name in ("thesis_repro", "keypoint_study", "street_world", "opencv_exact", "notebooks"):
-        shutil.copytree(ROOT / name, root / name, ignore=shutil.ignore_patterns("__pycache__"))
-    shutil.copy(ROOT / "Makefile", root)
+    copy_project([*PACKAGES, "notebooks", "Makefile"], root)
     (root / "run/notebooks").mkdir(parents=True)
     record(root, root / "run")
     for name in ("checked", "drives", *(f"notebooks/{name}" for name in NOTEBOOKS)):
@@ -66,4 +59,4 @@ def test_what_uses_other_contents_is_executed_again(project, tmp_path, changes, 
     planned = succeed(["make", "-n", "notebooks", f"RUN={run}"], project).stdout
     for path, text in before.items():
         path.write_text(text)
-    assert sorted(EXECUTED.findall(planned)) == again.split()
+    assert executed_by(planned) == again.split()
