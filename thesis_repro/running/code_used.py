@@ -106,7 +106,7 @@ def _of_place(place: Place) -> tuple[str, list[Place]]:
     code = _code(path.read_text(encoding="utf-8"))
     if name in code.imports:
         return "", [Place(module), code.imports[name]]
-    if name in code.definitions or not name:
+    if name in code.definitions or name in ("", "__file__"):  # a path needs no definition
         nodes = code.definitions.get(name, [])
         more = [Place(module)] if name else [Place(module.rpartition(".")[0]), *code.loads]
     else:  # all of it, or a name that is made as the module runs
