@@ -3,7 +3,7 @@
 import json
 import os
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from contextlib import redirect_stdout, suppress
 from dataclasses import replace
 from itertools import chain
@@ -57,7 +57,7 @@ def predict(options: Any) -> None:
     """
     from thesis_repro.segmentation import quietly
 
-    images = list(_image_folders(options.images))
+    images = _image_folders(options.images)
     _check_outputs(options, options.images)
     with quietly():  # this import takes seconds, so the files are checked first
         from thesis_repro.segmentation import prediction, training
@@ -286,10 +286,14 @@ def _text(record: dict[str, Any], sequence: Any, speed: float | None) -> str:
             f"no ground truth to compare with ({one_line(sequence.poses_path)} does not exist); "
             f"assumed steps: {steps}"
         )
-    lines.append(f"mean keypoints  {record['mean_keypoints']:.1f}")
-    lines.append(f"time a frame    {record['ms_per_frame']:.1f} ms")
-    for flag, count in record["flagged"].items():
-        lines.append(f"flagged         {count} frame{'s' if count > 1 else ''}: {flag}")
+    lines += [
+        f"mean keypoints  {record['mean_keypoints']:.1f}",
+        f"time a frame    {record['ms_per_frame']:.1f} ms",
+    ]
+    lines += [
+        f"flagged         {count} frame{'s' if count > 1 else ''}: {flag}"
+        for flag, count in record["flagged"].items()
+    ]
     return "\n".join(lines)
 
 
@@ -357,8 +361,8 @@ def _warn(lines: Iterable[str]) -> list[str]:
     return warnings
 
 
-def _image_folders(root: Path) -> Iterator[tuple[Path, list[Path]]]:
-    """Yield (folder, its images) for each sequence that a path names.
+def _image_folders(root: Path) -> list[tuple[Path, list[Path]]]:
+    """Return (folder, its images) for each sequence that a path names.
 
     The path is a folder of images, a sequence, a KITTI folder or a folder of sequences.
     Raises InputError if there are no images.
@@ -371,8 +375,7 @@ def _image_folders(root: Path) -> Iterator[tuple[Path, list[Path]]]:
         if not parent.is_dir():
             parent = root
         folders = layout.folders_with_frames(parent) or [root]
-    for folder in folders:
-        yield folder, layout.files(folder).frames
+    return [(folder, layout.files(folder).frames) for folder in folders]
 
 
 def _mask_settings(options: Any, has_labels: bool = True) -> Any:

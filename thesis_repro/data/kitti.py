@@ -31,11 +31,11 @@ def sequences(root: str | Path) -> list[str]:
     00 to 10 are listed even without a file of poses, so that `Sequence` reports the missing file.
     Raises InputError if there are none.
     """
-    names = []
-    for name in with_frames(root):
-        poses = layout.poses(layout.locate(root, name))
-        if name in CAMERAS or poses.exists():
-            names.append(name)
+    names = [
+        name
+        for name in with_frames(root)
+        if name in CAMERAS or layout.poses(layout.locate(root, name)).exists()
+    ]
     if not names:
         raise InputError(
             f"{layout.sequences_folder(root)}: no sequence holds frames and ground truth"

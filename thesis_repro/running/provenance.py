@@ -151,10 +151,8 @@ def versions(*packages: str) -> dict[str, Any]:
     "opencv" is any of its four. The machine is "x86_64" or "arm64", say: OpenCV and TensorFlow
     round differently on other architectures.
     """
-    found = {"opencv": cv2.__version__}
-    for name in set(packages) - {"opencv"}:
-        found[name] = metadata.version(name)
-    return {"versions": found, "machine": platform.machine()}
+    found = {name: metadata.version(name) for name in packages if name != "opencv"}
+    return {"versions": {"opencv": cv2.__version__, **found}, "machine": platform.machine()}
 
 
 def digest_of_files(paths: Iterable[str | Path]) -> str:
