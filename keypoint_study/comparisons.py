@@ -57,7 +57,6 @@ COLUMNS = (
     "mean",
     "mean_low",
     "mean_high",
-    "detectable",
     "n",
     "above",
     "far_off",

@@ -8,9 +8,8 @@
 3. Its interval is that of Wilcoxon's signed-rank test, which is exact. It estimates how far the
    ratio could be off if other sequences of the same kind had been recorded.
 
-Beside it stand the geometric mean with Student's t interval, which one failing sequence widens
-until it says nothing; and `detectable`, the mean ratio that so few and so different sequences would
-show in 80 % of studies.
+Beside it stands the geometric mean with Student's t interval, which one failing sequence widens
+until it says nothing.
 
 How often a method fails is a question of its own, which the ratio does not answer. A run has failed
 if one of its steps has, or if it is lost (`metrics.step_errors`).
@@ -29,7 +28,6 @@ from scipy.special import bdtr, stdtrit
 from keypoint_study.verdicts import LEVEL, NARROW_LEVEL
 
 MIN_FOR_INTERVAL = 3  # values of a mean
-POWER = 80  # percent of studies that would show the detectable ratio
 # a sequence is named beside the mean if its ratio differs from the median by more than this factor
 FAR_OFF = 3
 
@@ -75,22 +73,15 @@ def typical_ratio(ratios: ArrayLike) -> dict[str, Any]:
     """Return the typical ratio of one ratio a sequence, and what stands beside it.
 
     {ratio, low, high (`typical_interval` of the logarithms); mean, mean_low, mean_high (the
-    geometric mean, `mean_interval`); detectable (a ratio above 1); n (sequences), above (those with
-    a ratio above 1)}
+    geometric mean, `mean_interval`); n (sequences), above (those with a ratio above 1)}
     """
     logarithms = np.log(np.asarray(ratios, float))
     logarithms = logarithms[np.isfinite(logarithms)]
-    n = len(logarithms)
-    mean, detectable = np.nan, np.nan
-    if n:
-        mean = logarithms.mean()
-    if n >= MIN_FOR_INTERVAL:
-        reach = stdtrit(n - 1, (100 + LEVEL) / 200) + stdtrit(n - 1, POWER / 100)
-        detectable = reach * logarithms.std(ddof=1) / np.sqrt(n)
-    intervals = [*typical_interval(logarithms), mean, *mean_interval(logarithms), detectable]
-    names = ("ratio", "low", "high", "mean", "mean_low", "mean_high", "detectable")
+    mean = logarithms.mean() if len(logarithms) else np.nan
+    intervals = [*typical_interval(logarithms), mean, *mean_interval(logarithms)]
+    names = ("ratio", "low", "high", "mean", "mean_low", "mean_high")
     numbers = dict(zip(names, np.exp(intervals).tolist(), strict=True))
-    return {**numbers, "n": n, "above": int((logarithms > 0).sum())}
+    return {**numbers, "n": len(logarithms), "above": int((logarithms > 0).sum())}
 
 
 def narrow_interval(ratios: ArrayLike) -> tuple[float, float]:

@@ -32,7 +32,7 @@ def page_of(artefacts: list[dict[str, Any]], **facts: Any) -> str:
     compared = dict.fromkeys(facts["kinds"][source.kind] for source in facts["study"].sources)
     title = f"{' and '.join(compared).capitalize()}, compared with all keypoints"
     return texts.render(
-        "study.html.j2", title=title, artefacts=artefacts, made=versions() | machine(), **facts
+        "study.html.j2", title=title, artefacts=artefacts, made=made_with(), **facts
     )
 
 
@@ -62,18 +62,14 @@ def from_markdown(text: str) -> Markup:
     return Markup(convert(text))
 
 
-def versions() -> dict[str, Any]:
-    """Return the packages of the results, with their versions."""
+def made_with() -> dict[str, Any]:
+    """Return the packages, the Python, the machine and the commit of the results."""
     found = {}
     for name in PACKAGES:
         with suppress(importlib.metadata.PackageNotFoundError):  # a study needs no TensorFlow
             found[name] = importlib.metadata.version(name)
-    return {"packages": found}
-
-
-def machine() -> dict[str, Any]:
-    """Return the Python, the machine and the commit of the results."""
-    facts = {
+    facts: dict[str, Any] = {
+        "packages": found,
         "python": platform.python_version(),
         "machine": f"{platform.system()} {platform.machine()}",
     }
