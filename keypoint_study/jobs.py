@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from keypoint_study.methods import LABEL_MAPS, MASK_CONTROLS, METHODS, changed
-from keypoint_study.sources import UNMASKED, Source, by_name
+from keypoint_study.sources import UNMASKED, Source
 from thesis_repro.data.kitti import TRUE_LABELS, Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.odometry import OdometrySettings, estimators
@@ -90,17 +90,17 @@ class Run(NamedTuple):
 def runs_of(
     jobs: Iterable[Job],
     sequences: Iterable[Sequence],
-    sources: Path | Iterable[Source],
+    sources: Iterable[Source],
     settings: Mapping[str, Any] = {},
     masked_settings: Mapping[str, Any] = {},
 ) -> dict[Job, Run | str]:
     """Return the runs of jobs, or the reason why one cannot run, as `runner.run_all` takes them.
 
-    sources: of the jobs, or a folder with one folder of label maps a sequence. settings: changes of
-    all runs; masked_settings: of those with masks. Jobs with the same masks get the same object, by
-    which `odometry.run_many` recognises that they share work.
+    sources: of the jobs. settings: changes of all runs; masked_settings: of those with masks. Jobs
+    with the same masks get the same object, by which `odometry.run_many` recognises that they share
+    work.
     """
-    sources_by_name = by_name(sources)
+    sources_by_name = {source.name: source for source in sources}
     default = next(iter(sources_by_name.values()))
     opened = {sequence.name: sequence for sequence in sequences}
 

@@ -62,11 +62,6 @@ class Outcome:
         """Number of runs that had a result from before."""
         return len(self.table) - self.made
 
-    @property
-    def failed_jobs(self) -> int:
-        """Number of jobs that failed."""
-        return len(self.reasons)
-
     def after(self, first: "Outcome") -> "Outcome":
         """Return the outcome of both calls, of which this one had the runs of the first, too."""
         return Outcome(

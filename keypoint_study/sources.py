@@ -203,13 +203,6 @@ def read_path(path: Path, sequence: Sequence) -> np.ndarray:
     return poses
 
 
-def by_name(sources: Path | Iterable[Source]) -> dict[str, Source]:
-    """Return sources by name. A folder becomes a single source with an empty name."""
-    if isinstance(sources, Path):
-        sources = [Source(sources)]
-    return {source.name: source for source in sources}
-
-
 def named(
     folders: Iterable[tuple[str, str | None, Path]],
     settings: MaskSettings,

@@ -248,15 +248,14 @@ def choices_of(
     with_controls: bool = True,
     masked_settings: Mapping[str, Any] = {},
     named: Collection[str] = (),
-) -> tuple[Choices, dict[str, Path]]:
-    """Return the choices of a study for `worth_of`, and the files of own keypoints by name.
+) -> Choices:
+    """Return the choices of a study for `worth_of`.
 
     numbers: see `worth_of`. Random and spread keypoints, masks and own keypoints have each of them,
     the other choices only DECIDING. with_controls: also masks that are filled, and the controls of
     `jobs.mask_controls`; named: see there.
     """
     chosen: dict[tuple[str, int], tuple] = {}
-    own = {}
     for number in numbers:
         chosen["random keypoints", number] = THESIS, None
         if number:
@@ -266,7 +265,6 @@ def choices_of(
     for source in sources:
         prefix = f"{source.name}: " if source.name else ""
         if source.kind == "keypoints":
-            own[source.name] = source.folder
             chosen |= {(source.name, number): (THESIS, None) for number in numbers}
         if source.kind in UNMASKED:
             continue
@@ -282,7 +280,7 @@ def choices_of(
                 settings, control = METHODS[name].choose(sequence, source, width_of_control)
                 settings = changed(settings, masked_settings)
                 chosen[prefix + METHODS[name].title, DECIDING] = settings, control
-    return chosen, own
+    return chosen
 
 
 def worths_of(
@@ -303,9 +301,10 @@ def worths_of(
     """
     sources, numbers = list(sources), list(numbers)
     digest = cache(provenance.digest_of_files)
+    own = {source.name: source.folder for source in sources if source.kind == "keypoints"}
     calls: list[tuple] = []
     for sequence in sequences:
-        chosen, own = choices_of(sequence, sources, width, numbers, **options)
+        chosen = choices_of(sequence, sources, width, numbers, **options)
         records = {
             f"{name} {number}": record_of(*chosen[name, number], digest) for name, number in chosen
         }

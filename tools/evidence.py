@@ -150,7 +150,7 @@ def runs_of_widths(settings, sequences, labels):
     ]
     folder = settings.build / "refined_widths"
     return runner.run_all(
-        jobs.runs_of(planned, sequences, labels), folder, processes=settings.jobs
+        jobs.runs_of(planned, sequences, [Source(labels)]), folder, processes=settings.jobs
     ).table
 
 

@@ -132,7 +132,6 @@ def _draw_ratios(
     panel: Axes, rows: pd.DataFrame, order: list[str], sequences: list[str], reach: float
 ) -> None:
     """Draw the ratios of one estimator and metric, each at the place of its label in `order`."""
-    style.ratio_axis(panel.xaxis, [1 / reach, reach])
     dot: dict[str, Any] = {"color": "#555555", "markersize": 4, "markeredgewidth": 0}
     edges = {1 / reach: ("<", "left"), reach: (">", "right")}
     for _, row in rows.iterrows():
@@ -153,10 +152,7 @@ def _draw_ratios(
                 panel.text(edge, y - 0.22, f" {named} ", va="bottom", ha=side, fontsize=7)
             if ((ends - edge) * (edge - 1) > 0).any():  # farther from 1 than the edge
                 panel.plot(edge, y + 0.2, marker, color=color, markersize=5, clip_on=False)
-    panel.axvline(1, color="black", linewidth=0.8)
-    panel.grid(axis="y", visible=False)
-    panel.set_yticks(range(len(order)), order)
-    panel.set_ylim(len(order) - 0.5, -0.7)
+    style.ratio_rows(panel, order, reach)
     panel.tick_params(labelsize=7)
 
 

@@ -207,6 +207,18 @@ def ratio_axis(axis: Any, values: np.ndarray | list[float]) -> None:
     axis.set_minor_locator(NullLocator())
 
 
+def ratio_rows(panel: plt.Axes, names: list[str], reach: float) -> None:
+    """Give a panel a row for each name, the first on top, and an axis of ratios.
+
+    The axis goes from 1 / reach to reach, with a line at 1.
+    """
+    ratio_axis(panel.xaxis, [1 / reach, reach])
+    panel.axvline(1, color="black", linewidth=0.8)
+    panel.grid(axis="y", visible=False)
+    panel.set_yticks(range(len(names)), names)
+    panel.set_ylim(len(names) - 0.5, -0.7)
+
+
 def save_figure(figure: plt.Figure, folder: Path, name: str, note: str) -> str:
     """Write folder/name.webp if the figure contains images, else folder/name.svg; return its name.
 

@@ -79,7 +79,6 @@ def figure_of_worths(
         rows, len(SHOWN) // rows, height, width, sharex=True, sharey=True, squeeze=False
     )
     for panel, motion in zip(panels.flat, SHOWN, strict=True):
-        style.ratio_axis(panel.xaxis, [1 / REACH, REACH])
         for place, choice in enumerate(order):
             values = shown.loc[shown["choice"] == choice, motion]
             beyond = (values < 1 / REACH) | (values > REACH)
@@ -91,11 +90,9 @@ def figure_of_worths(
                 look = style.interval_style(style.MASKED, "|")
                 panel.plot(np.clip(interval, 1 / REACH, REACH), [place + 0.2] * 2, **look)
             panel.plot(estimate, place + 0.2, "D", color=style.MASKED, markersize=4)
-        panel.axvline(1, color="black", linewidth=0.8)
-        panel.grid(axis="y", visible=False)
+        style.ratio_rows(panel, order, REACH)
         panel.set_title(f"{motion}, {number or 'all'} keypoints")
-        panel.set_yticks(range(len(order)), order, fontsize=8)
-        panel.set_ylim(len(order) - 0.5, -0.7)
+        panel.tick_params("y", labelsize=8)
     for panel in panels[-1]:
         panel.set_xlabel("worth of a keypoint (random: 1)", fontsize=8)
     return Artefact(

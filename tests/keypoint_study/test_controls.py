@@ -98,7 +98,7 @@ def test_a_methods_own_settings_win_and_nothing_joins_a_study_unasked(
         runs = runs_of(planned, [sequence], [source], {"scale_gate": 0.5}, few)
         settings = {job.method: run.settings for job, run in runs.items()}
         assert set(named) == {"orb-on-masks"} & set(settings)
-        chosen, _ = worth.choices_of(sequence, [source], WIDTH, (400,), True, few, named)
+        chosen = worth.choices_of(sequence, [source], WIDTH, (400,), True, few, named)
         assert set(named) == {"orb-on-masks"} if ("ORB on masks", 400) in chosen else not named
     assert settings["masked"].detector == keypoints.spread(200)
     assert settings["orb-on-masks"] == replace(THESIS, detector=keypoints.orb, scale_gate=0.5)
@@ -187,13 +187,15 @@ def test_controls_leave_as_many_keypoints_as_masks_of_the_tested_width(
     opened = [Sequence(small_world / "kitti", "00").subset(5)]
     jobs = first_jobs(opened, {"thesis": (5, WIDTH), "refined": ()}, tested=5)
     assert {job.dilation_width for job in jobs if job.method in methods.MASK_CONTROLS} == {5}
-    runs = runner.run_all(runs_of(jobs, opened, small_labels), tmp_path).table
+    runs = runner.run_all(runs_of(jobs, opened, [Source(small_labels)]), tmp_path).table
     left = comparisons.keypoints_left(runs)
     masked = comparisons.of_method(runs, "masked")
     jobs += section_4_2.reduced_jobs(section_4_2.best_widths(masked))
     jobs += runner.keypoint_controls(runs, opened, [Source(small_labels)], 1, 5)
     assert len({job.name for job in jobs}) == len(jobs)
-    runs = runner.run_all(runs_of(jobs, opened, small_labels), tmp_path).table.set_index("run")
+    runs = runner.run_all(runs_of(jobs, opened, [Source(small_labels)]), tmp_path).table.set_index(
+        "run"
+    )
     assert list(runs.index) == [job.name for job in jobs] and comparisons.tested_width(runs) == 5
     number = runs["mean_keypoints"]
     assert left["00"] == number["masked-05-0"] < number["masked-10-0"]

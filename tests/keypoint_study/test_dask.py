@@ -14,6 +14,7 @@ from trials import ROOT, wait_for
 
 from keypoint_study import runner
 from keypoint_study.jobs import first_jobs, runs_of
+from keypoint_study.sources import Source
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.running import workers
@@ -81,7 +82,7 @@ def test_a_cluster_gives_the_same_bits_although_a_worker_is_killed(
 ):
     opened = [Sequence(small_world / "kitti", name) for name in ("00", "01")]
     jobs = first_jobs(opened, {"thesis": (5, 15)}, repetitions=2)
-    runs = runs_of(jobs, opened, small_labels)
+    runs = runs_of(jobs, opened, [Source(small_labels)])
     here = runner.run_all(runs, tmp_path / "here")
     there = tmp_path / "there"
 

@@ -33,12 +33,12 @@ def opened(world, frames=None):
 def finished(small_world, small_labels, tmp_path_factory):
     folder = tmp_path_factory.mktemp("odometry")
     jobs = first_jobs(opened(small_world), {"thesis": WIDTHS})
-    runs = runs_of(jobs, opened(small_world), small_labels)
+    runs = runs_of(jobs, opened(small_world), [Source(small_labels)])
     summary = runner.run_all(runs, folder, processes=2).table
     jobs += section_4_2.reduced_jobs(
         section_4_2.best_widths(comparisons.of_method(summary, "masked"))
     )
-    runs = runs_of(jobs, opened(small_world), small_labels)
+    runs = runs_of(jobs, opened(small_world), [Source(small_labels)])
     return folder, jobs, runner.run_all(runs, folder).table
 
 
@@ -65,10 +65,10 @@ def test_only_missing_runs_are_run_again(small_world, small_labels, finished):
     times = {path: path.stat().st_mtime_ns for path in folder.rglob("*.csv")}
     missing = folder / "00" / "masked-05-0.csv"
     missing.unlink()
-    again = runner.run_all(runs_of(jobs, opened(small_world), small_labels), folder)
+    again = runner.run_all(runs_of(jobs, opened(small_world), [Source(small_labels)]), folder)
     assert [path for path in times if path.stat().st_mtime_ns != times[path]] == [missing]
     pd.testing.assert_frame_equal(again.table, summary)
-    assert (again.made, again.kept, again.failed_jobs) == (1, len(jobs) - 1, 0)
+    assert (again.made, again.kept, len(again.reasons)) == (1, len(jobs) - 1, 0)
 
 
 @pytest.mark.parametrize("error", [OSError("pulled the plug"), RuntimeError("a fault")])
@@ -85,11 +85,13 @@ def test_a_stopped_pass_is_repeated_and_ends_as_an_undisturbed_one(
 
     with monkeypatch.context() as patch:
         patch.setattr(Sequence, "frame", frame)
-        outcome = runner.run_all(runs_of(jobs, opened(small_world), small_labels), tmp_path)
-    assert set(outcome.table["sequence"]) == {"00"} and outcome.failed_jobs == 4
+        outcome = runner.run_all(
+            runs_of(jobs, opened(small_world), [Source(small_labels)]), tmp_path
+        )
+    assert set(outcome.table["sequence"]) == {"00"} and len(outcome.reasons) == 4
     assert str(error) in outcome.warnings[0]
     times = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.csv")}
-    runner.run_all(runs_of(jobs, opened(small_world), small_labels), tmp_path)
+    runner.run_all(runs_of(jobs, opened(small_world), [Source(small_labels)]), tmp_path)
     assert times == {path: path.stat().st_mtime_ns for path in times} and len(times) == 4
     for job in jobs:
         whole, repeated = (
@@ -113,9 +115,9 @@ def test_a_failed_run_is_reported_and_stops_no_other_run(
         Job("00", "masked", dilation_width=0),
     ]
     outcome = runner.run_all(
-        runs_of(jobs, opened(small_world, 5), tmp_path / "labels"), tmp_path / "runs"
+        runs_of(jobs, opened(small_world, 5), [Source(tmp_path / "labels")]), tmp_path / "runs"
     )
-    assert (outcome.made, outcome.kept, outcome.failed_jobs) == (2, 0, len(jobs) - 2)
+    assert (outcome.made, outcome.kept, len(outcome.reasons)) == (2, 0, len(jobs) - 2)
     assert list(outcome.table["run"]) == ["baseline-0", "true-labels-10-0"]
     printed = capsys.readouterr().err
     assert (
@@ -124,7 +126,10 @@ def test_a_failed_run_is_reported_and_stops_no_other_run(
     )
     assert "sequence 00, masked-00-0: failed: dilation width 0" in printed
     with pytest.raises(InputError, match="all 1 odometry runs failed; the first: dilation width 0"):
-        runner.run_all(runs_of(jobs[-1:], opened(small_world), small_labels), tmp_path / "none")
+        runner.run_all(
+            runs_of(jobs[-1:], opened(small_world), [Source(small_labels)]),
+            tmp_path / "none",
+        )
 
 
 def test_a_sequence_without_structure_has_no_result(tiny_kitti, tmp_path):
@@ -134,17 +139,19 @@ def test_a_sequence_without_structure_has_no_result(tiny_kitti, tmp_path):
         cv2.imwrite(str(path), np.full((48, 64), 128, np.uint8))
     sequences = [Sequence(tiny_kitti, name) for name in ("00", "01")]
     jobs = [Job(name, "baseline", repetition=number) for name in ("00", "01") for number in (0, 1)]
-    outcome = runner.run_all(runs_of(jobs, sequences, tmp_path / "none"), tmp_path / "runs")
-    assert (outcome.made, outcome.kept, outcome.failed_jobs) == (2, 0, 2)
+    outcome = runner.run_all(
+        runs_of(jobs, sequences, [Source(tmp_path / "none")]), tmp_path / "runs"
+    )
+    assert (outcome.made, outcome.kept, len(outcome.reasons)) == (2, 0, 2)
     assert set(outcome.table["sequence"]) == {"00"}
     assert len(outcome.warnings) == 1 and "sequence 01, " in outcome.warnings[0]
     with pytest.raises(InputError, match="sequence 01: "):
-        runner.run_all(runs_of(jobs[2:], sequences, tmp_path / "none"), tmp_path / "runs")
+        runner.run_all(runs_of(jobs[2:], sequences, [Source(tmp_path / "none")]), tmp_path / "runs")
 
 
 def test_a_run_with_other_settings_is_made_again_and_no_other(small_world, small_labels, tmp_path):
     jobs = [Job("00", "baseline"), Job("00", "masked", 5)]
-    given = jobs, opened(small_world, 4), small_labels
+    given = jobs, opened(small_world, 4), [Source(small_labels)]
     first = runner.run_all(runs_of(*given), tmp_path)
     runs = runs_of(*given, masked_settings={"detector": filtered})
     changed, again = runner.run_all(runs, tmp_path), runner.run_all(runs, tmp_path)

@@ -140,7 +140,7 @@ def test_a_repeated_study_runs_nothing_and_another_source_only_its_runs(
         patch.setattr(runner.odometry, "run_many", None)  # would fail
         again = study.run(folder)
     assert again.table.equals(runs)
-    assert (again.made, again.kept, again.failed_jobs) == (0, len(runs), 0)
+    assert (again.made, again.kept, len(again.reasons)) == (0, len(runs), 0)
     other = tmp_path / "other"
     shutil.copytree(small_labels, other)
     for path in other.rglob("*.png"):

@@ -217,9 +217,9 @@ def study(options: Any) -> int:
         except InputError as error:  # the runs are there, so their page is written
             warnings += _warn([f"no worth of keypoints: {error}"])
         page = study_report.write(planned, outcome.table, folder, warnings, worths)
-    made = f"{len(outcome.table):,} runs, {outcome.failed_jobs:,} failed"
+    made = f"{len(outcome.table):,} runs, {len(outcome.reasons):,} failed"
     program.summary(f"{made}; open {page} in a browser", outcome.kept)
-    return int(outcome.failed_jobs > 0)
+    return int(bool(outcome.reasons))
 
 
 COMMANDS = {
