@@ -16,7 +16,7 @@ MIN_SEQUENCES = 6
 
 LOWER, HIGHER = "lower", "higher"
 LESS, MORE, AS_MUCH = "less", "more", "as much"
-AS_GOOD, NO_WORSE = "as good", "no worse"
+AS_GOOD, NO_WORSE, NOT_SHOWN = "as good", "no worse", "not shown to be"
 NO_CLEAR_DIFFERENCE = "no clear difference"
 TOO_FEW = "too few sequences to tell"
 
@@ -26,14 +26,15 @@ class Rule(NamedTuple):
 
     below, above: the whole intervals of LEVEL lie on this side of 1, for all quantities together.
     within: the intervals of NARROW_LEVEL lie between 1 / margin and margin. under: only their upper
-    ends lie below it. Neither is said of a choice that fails on more sequences. margins: of the
-    quantities.
+    ends lie below it. Neither is said of a choice that fails on more sequences. otherwise: none of
+    these. margins: of the quantities.
     """
 
     below: str = NO_CLEAR_DIFFERENCE
     above: str = NO_CLEAR_DIFFERENCE
     within: str = NO_CLEAR_DIFFERENCE
     under: str = NO_CLEAR_DIFFERENCE
+    otherwise: str = NO_CLEAR_DIFFERENCE
     margins: Mapping[str, float] = {}
 
 
@@ -45,7 +46,12 @@ FAILURES = Rule(LOWER, HIGHER)
 WORTH = Rule(LESS, MORE, AS_MUCH, margins={"rotation": 1.25, "direction": 1.25})
 # of errors with few keypoints, which may be a little larger. NO_WORSE was added when the results
 # were known, because AS_GOOD also refuses choices that are better.
-FEW_KEYPOINTS = Rule(within=AS_GOOD, under=NO_WORSE, margins={"se3": 1.25, "rotation": 1.1})
+FEW_KEYPOINTS = Rule(
+    within=AS_GOOD,
+    under=NO_WORSE,
+    otherwise=NOT_SHOWN,
+    margins={"se3": 1.25, "rotation": 1.1},
+)
 
 
 def verdict(
@@ -70,7 +76,7 @@ def verdict(
         return rule.above
     ends = [(low * rule.margins[name], high / rule.margins[name]) for name, low, high in narrow]
     if not ends or fails_more or not all(high < 1 for _, high in ends):
-        return NO_CLEAR_DIFFERENCE
+        return rule.otherwise
     if all(low > 1 for low, _ in ends):
         return rule.within
     return rule.under
