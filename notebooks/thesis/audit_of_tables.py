@@ -139,8 +139,10 @@ def _of_changes(metric: str) -> list[dict[str, Any]]:
     """Return rows 1, 4 and 41 for one metric."""
     change = CHANGES[metric]
     by_sequence = 1 + change / 100
+    larger, improved = (change > 0).sum(), (change < 0).sum()
     # the best of as many widths as there are is better by chance nearly always
-    by_chance = len(change) * WIDTHS_TRIED / (WIDTHS_TRIED + 1)
+    by_chance = WIDTHS_TRIED / (WIDTHS_TRIED + 1)
+    sign_test = binomtest(int(improved), len(change), by_chance, alternative="less")
     on_average = "sequences improved on average if masks did nothing"
     probability = (
         "probability of no more improved sequences if masks did nothing, 15 independent widths"
@@ -148,7 +150,6 @@ def _of_changes(metric: str) -> list[dict[str, Any]]:
     of_ratios = ratio(
         "1", "geometric mean of the error ratios", by_sequence, geometric_mean=True, metric=metric
     )
-    larger, improved = (change > 0).sum(), (change < 0).sum()
     return [
         measurement("1", "sum of eleven percentages", change.sum(), "%", metric=metric),
         measurement("1", "mean of the percentages", change, "%", metric=metric),
@@ -156,19 +157,9 @@ def _of_changes(metric: str) -> list[dict[str, Any]]:
         of_ratios,
         measurement("4", "sequences with a larger error", larger, "sequences", metric=metric),
         measurement("41", "sequences improved", improved, "sequences", metric=metric),
-        measurement("41", on_average, by_chance, "sequences", metric=metric),
-        measurement("41", probability, 100 * _sign_test(metric), "%", metric=metric),
+        measurement("41", on_average, len(change) * by_chance, "sequences", metric=metric),
+        measurement("41", probability, 100 * sign_test.pvalue, "%", metric=metric),
     ]
-
-
-def _sign_test(metric: str) -> float:
-    """Return how probable it is that the best of WIDTHS_TRIED improves no more sequences.
-
-    They are those of the thesis, for masks that do nothing and independent widths.
-    """
-    change, by_chance = CHANGES[metric], WIDTHS_TRIED / (WIDTHS_TRIED + 1)
-    improved = int((change < 0).sum())
-    return float(binomtest(improved, len(change), by_chance, alternative="less").pvalue)
 
 
 def of_study(runs: pd.DataFrame, shuffled: pd.DataFrame) -> list[dict[str, Any]]:

@@ -119,7 +119,6 @@ PROFILES = {
         world=street_world.SIZES["thesis"],
     ),
 }
-SEED = 0
 
 
 @dataclass(frozen=True)
@@ -143,7 +142,7 @@ class Settings:
     jobs: int
     scheduler: str | None = None  # address of a Dask scheduler
     kitti_semantic: Path | None = None  # the user's folder of KITTI street scenes with label maps
-    seed: int = SEED
+    seed: int = 0
 
     @property
     def uses_shipped_model(self) -> bool:

@@ -168,17 +168,21 @@ YOUR_LOOP = {
 
 
 @pytest.fixture
-def build(small_world, small_labels, tmp_path, monkeypatch):
+def choose(tmp_path, monkeypatch):
+    """A function that sets settings of a run in a folder of its own."""
+
+    def set_variables(**settings):
+        for name, value in ({"BUILD": tmp_path} | settings).items():
+            monkeypatch.setenv(PREFIX + name, str(value))
+
+    return set_variables
+
+
+@pytest.fixture
+def build(small_world, small_labels, choose):
     """The folder of a run on the small world, with the label maps of notebook 5."""
-    values = {
-        "PROFILE": "smoke",
-        "FRAMES": 5,
-        "KITTI": small_world / "kitti",
-        "CITYSCAPES": small_world / "cityscapes",
-        "BUILD": tmp_path,
-    }
-    for name, value in values.items():
-        monkeypatch.setenv(PREFIX + name, str(value))
+    world = {"KITTI": small_world / "kitti", "CITYSCAPES": small_world / "cityscapes"}
+    choose(PROFILE="smoke", FRAMES=5, **world)
     read_settings().build.mkdir(parents=True)
     (read_settings().build / "labels").symlink_to(small_labels)
     return read_settings().build
@@ -264,10 +268,9 @@ def test_exercise_04_2(networks):
 
 
 @pytest.mark.torture
-def test_exercise_04_1(tmp_path, monkeypatch):
+def test_exercise_04_1(choose):
     """In the lab: the cross-entropy is ahead after two epochs, the thesis's loss after four."""
-    monkeypatch.setenv(PREFIX + "PROFILE", "lab")
-    monkeypatch.setenv(PREFIX + "BUILD", str(tmp_path))
+    choose(PROFILE="lab")
     run("01", READING.replace("03", "03 05") + " 25")
     run("02", f"{TRANSFORMS} 32 08 24 29 17 34")
     run("03", f"{NETWORK} 27")
@@ -290,14 +293,13 @@ def test_exercise_05_1(build):
 
 
 @pytest.mark.notebooks
-def test_exercise_05_2(executed, small_world, monkeypatch, tmp_path):
+def test_exercise_05_2(executed, small_world, choose):
     """The model in the package is ahead, and its masks keep more of the true boundaries."""
     build = executed / "build/embedded-smoke"
     columns = pd.read_csv(build / "figures/domain_gap.csv").set_index("measure").astype(float)
     own, package = (columns.filter(like=text) for text in ("of this run", "in the package"))
     assert (package.loc["pixel accuracy"].to_numpy() > own.loc["pixel accuracy"].to_numpy()).all()
-    for name, text in (("KITTI", small_world / "kitti"), ("BUILD", tmp_path), ("FRAMES", 5)):
-        monkeypatch.setenv(PREFIX + name, str(text))
+    choose(KITTI=small_world / "kitti", FRAMES=5)
     artefacts.predict_with_model_in_package()
     kept = []
     sequence = tr.Sequence(small_world / "kitti", "00")
@@ -381,9 +383,8 @@ def test_exercises_07_1_and_07_3(build):
 
 
 @pytest.mark.torture
-def test_errors_of_the_lab_that_exercises_06_2_07_1_and_07_2_promise(tmp_path, monkeypatch):
-    monkeypatch.setenv(PREFIX + "PROFILE", "lab")
-    monkeypatch.setenv(PREFIX + "BUILD", str(tmp_path))
+def test_errors_of_the_lab_that_exercises_06_2_07_1_and_07_2_promise(choose):
+    choose(PROFILE="lab")
     thesis, sky, _ = rows_of("06", MASKS, SKY)  # as if opened first
     assert sky["keypoints"] < 0.3 * thesis["keypoints"] and sky[ROTATION] > 3 * thesis[ROTATION]
     run("06", MASKS)

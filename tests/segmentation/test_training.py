@@ -20,8 +20,6 @@ from thesis_repro.segmentation import augmentation, training
 pytestmark = pytest.mark.slow
 
 SIZE = 16
-# where another process finds this file and what it imports
-FOLDERS = [str(Path(__file__).parent), str(Path(emulated.__file__).parent)]
 
 
 def street(count, seed):
