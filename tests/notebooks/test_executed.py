@@ -1,15 +1,13 @@
 """What the notebooks show and write, and which of them `make figures` executes, and when."""
 
-import os
 import re
-import subprocess
 
 import nbformat
 import pytest
 from cells import NOTEBOOKS, executed_by, named
-from trials import PACKAGES, copy_project
+from trials import PACKAGES, copy_project, finish, start
 
-from thesis.settings import PREFIX, ROOT
+from thesis.settings import ROOT
 
 pytestmark = pytest.mark.notebooks
 FIGURES = [
@@ -25,20 +23,10 @@ SAVED = re.compile(r"^\w+\.save_figure\(", re.MULTILINE)
 
 
 def make_figures(tmp_path, *options, root=ROOT, target="figures"):
-    # MAKEFLAGS would pass the options of an outer make on to this one
-    environment = {
-        name: value
-        for name, value in os.environ.items()
-        if not name.startswith(("MAKE", "MFLAGS", PREFIX))
-    }
     folders = f"BUILD={tmp_path / 'build'}", f"FIGURES={tmp_path / 'figures'}"
-    return subprocess.run(
-        ["make", target, "PROFILE=smoke", *folders, "-o", ".venv/ready", *options],
-        cwd=root,
-        env=environment | {"PYTHONPATH": str(root)},
-        capture_output=True,
-        text=True,
-    )
+    command = ["make", target, "PROFILE=smoke", *folders, "-o", ".venv/ready", *options]
+    # the options of an outer make are not for this one
+    return finish(start(command, root, PYTHONPATH=root, MAKEFLAGS=None, MFLAGS=None))
 
 
 def code_cells(executed, name):

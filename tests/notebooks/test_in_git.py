@@ -14,13 +14,37 @@ from thesis.settings import ROOT
 
 LOOP = "def path_by_hand("  # the one cell that may be longer
 # functions, classes and notebook commands in the listings of each section of the appendix
-CALLS = {"A.1": 2, "A.2.1": 8, "A.2.2": 10, "A.2.3": 10, "A.3": 32, "A.4": 7, "A.5": 6, "A.5.2": 4}
-CALLS |= {"A.6": 9, "A.7.1": 13, "A.7.2": 17, "A.8": 15}
+CALLS = {
+    "A.1": 2,
+    "A.2.1": 8,
+    "A.2.2": 10,
+    "A.2.3": 10,
+    "A.3": 32,
+    "A.4": 7,
+    "A.5": 6,
+    "A.5.2": 4,
+    "A.6": 9,
+    "A.7.1": 13,
+    "A.7.2": 17,
+    "A.8": 15,
+}
 # the notebook of a section, and calls that are in another one
-MIRRORS: dict = {"A.1": "01", "A.2": "01", "A.3": "02", "A.4": "03", "A.5": "04", "A.6": "04"}
-MIRRORS |= {"A.7": "05", "A.8": "06", ("A.5.2", "build_unet"): "03"}
-WRITTEN_IN_05 = ("len", "np.expand_dims", "model.predict", "np.argmax")  # the label maps of A.8
-MIRRORS |= {("A.8", call): "05" for call in WRITTEN_IN_05}
+MIRRORS: dict = {
+    "A.1": "01",
+    "A.2": "01",
+    "A.3": "02",
+    "A.4": "03",
+    "A.5": "04",
+    "A.6": "04",
+    "A.7": "05",
+    "A.8": "06",
+    ("A.5.2", "build_unet"): "03",
+    # the label maps of A.8
+    ("A.8", "len"): "05",
+    ("A.8", "np.expand_dims"): "05",
+    ("A.8", "model.predict"): "05",
+    ("A.8", "np.argmax"): "05",
+}
 RENAMED = {"RandomBrightness": "RandomBrightnessContrast"}  # by the library
 
 

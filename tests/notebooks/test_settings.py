@@ -1,8 +1,7 @@
-import shutil
-import subprocess
 import sys
 
 import pytest
+from trials import copy_project, succeed
 
 from thesis.settings import PROFILES, ROOT, read_settings
 from thesis_repro.errors import InputError
@@ -68,16 +67,8 @@ def test_folders_begin_at_home_or_in_the_checkout(monkeypatch, tmp_path):
 
 
 def test_a_copy_for_the_lab_uses_the_results_of_the_checkout(tmp_path):
-    copied = ROOT / "notebooks/thesis", tmp_path / "thesis"
-    shutil.copytree(*copied, ignore=shutil.ignore_patterns("__pycache__"))
+    copy_project(["notebooks/thesis"], tmp_path)
     code = "import thesis.settings as s; print(s.__file__, s.read_settings({}).build)"
-    run = subprocess.run(
-        [sys.executable, "-c", code],
-        cwd=tmp_path,
-        env={"PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    run = succeed([sys.executable, "-c", code], tmp_path / "notebooks", PYTHONPATH=ROOT)
     used, build = run.stdout.split()
     assert used.startswith(str(tmp_path)) and build == str(ROOT / "build/embedded-demo")

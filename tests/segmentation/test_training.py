@@ -2,7 +2,6 @@
 
 import os
 import platform
-import subprocess
 import sys
 import time
 from pathlib import Path
@@ -12,6 +11,7 @@ import numpy as np
 import pytest
 import segmentation_models as sm
 import tensorflow as tf
+from trials import succeed
 
 import emulated
 from thesis_repro.errors import InputError
@@ -231,14 +231,9 @@ def test_one_core_and_all_give_the_same_bits(digest):
         "import os; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))}); "
         "import emulated; print(emulated.digest())"
     )
-    one_core = subprocess.run(
-        [sys.executable, "-c", code],
-        stdout=subprocess.PIPE,
-        text=True,
-        cwd=Path(emulated.__file__).parent,
-        env=os.environ | {"TF_USE_LEGACY_KERAS": "1", "KERAS_BACKEND": "jax"},
-        check=True,
-    )
+    tools = Path(emulated.__file__).parent
+    another_keras = {"TF_USE_LEGACY_KERAS": 1, "KERAS_BACKEND": "jax"}
+    one_core = succeed([sys.executable, "-c", code], tools, **another_keras)
     assert one_core.stdout.split()[-1] == digest
 
 

@@ -4,7 +4,6 @@ Also its errors and resuming.
 """
 
 import shutil
-import subprocess
 import sys
 from itertools import product
 
@@ -12,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from trials import contents
+from trials import contents, succeed
 
 import street_world
 from street_world import dataset, drives, raster, street, textures
@@ -187,7 +186,7 @@ def test_the_two_halves_make_the_whole_in_either_order(out, tmp_path, parts):
     assert contents(tmp_path) == contents(out)
 
 
-def test_it_runs_where_nobody_may_write_a_cache():
+def test_it_runs_where_nobody_may_write_a_cache(tmp_path):
     """As for an unknown user of a container, whose home is /."""
     code = "import numba.core.caching as c; c.CacheImpl._locator_classes = []; import street_world.raster"
-    subprocess.run([sys.executable, "-c", code], check=True)
+    succeed([sys.executable, "-c", code], tmp_path)
