@@ -229,8 +229,8 @@ def of_method(runs: pd.DataFrame, method: str, estimator: str | None = None) -> 
     estimator: by default the thesis's estimator if it was run, as for the tables of the thesis.
     """
     if estimator is None:
-        estimators_run = [name for name in ESTIMATORS if (runs["estimator"] == name).any()]
-        estimator = next(iter(estimators_run), "thesis")
+        were_run = set(runs["estimator"])
+        estimator = next((name for name in ESTIMATORS if name in were_run), "thesis")
     return runs[(runs["method"] == method) & (runs["estimator"] == estimator)]
 
 

@@ -153,19 +153,16 @@ def _checked_track(path: Path, track: Callable) -> Callable:
             tracked, was_found = track(previous, current, points, settings)
         except TypeError as error:
             raise InputError(f"{path}: track: {error}") from None
-        is_right = _kind(tracked) in ("float32", "float64") and tracked.shape == points.shape
-        if not is_right or _kind(was_found) != "bool" or was_found.shape != points.shape[:1]:
+        returned = inputs.described(tracked), inputs.described(was_found)
+        booleans = f"bool {points.shape[:1]}"
+        if returned not in [(f"float{bits} {points.shape}", booleans) for bits in (32, 64)]:
             raise InputError(
-                f"{path}: track returned {inputs.described(tracked)} and {inputs.described(was_found)}; must be "
-                f"float32 {points.shape} and bool {points.shape[:1]}, for as many points"
+                f"{path}: track returned {' and '.join(returned)}; must be float32 {points.shape} and "
+                f"{booleans}, for as many points"
             )
         return tracked.astype(np.float32, copy=False), was_found
 
     return checked
-
-
-def _kind(array: Any) -> str:
-    return str(getattr(array, "dtype", ""))
 
 
 def _try(path: Path, sequence: Sequence) -> None:

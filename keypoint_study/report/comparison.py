@@ -28,7 +28,7 @@ _INTERVAL = (
 )
 # {name: (title, caption)}
 CAPTIONS = {
-    "figure": (
+    "ratios_drawn": (
         "Masks and controls",
         "A ratio is an error divided by that of all keypoints under the same estimator: below 1 is "
         f"better. Grey dots are sequences, the diamond is the {_INTERVAL}, the bar with end caps. "
@@ -75,7 +75,7 @@ def figure_of_ratios(table: pd.DataFrame, source: str = "", width: float = PAGE_
     source: show only this one, with its controls. width: inches; one column has the estimator that
     decides alone, and its panels below each other.
     """
-    name, (title, caption) = "comparison", CAPTIONS["figure"]
+    name, (title, caption) = "comparison", CAPTIONS["ratios_drawn"]
     if source:
         table = table[table["source"].isin([source, ""])]
         name, title = f"comparison-{source}", f"{title} of {source}"
@@ -166,7 +166,7 @@ def _drawn(table: pd.DataFrame) -> pd.DataFrame:
     return rows
 
 
-def table_of_ratios(rows: pd.DataFrame) -> Artefact:
+def table_of_ratios(rows: pd.DataFrame) -> pd.DataFrame:
     """Return rows of `comparisons_of` for readers: one row for each pair of methods and estimator.
 
     A ratio is a text, "1.09 (0.98-1.32)", see `texts.short`. The verdict is that of all judging
@@ -202,15 +202,14 @@ def table_of_ratios(rows: pd.DataFrame) -> Artefact:
     if lines:
         # missing for paths of another system
         table["number"] = table["number"].round().astype("Int64")
-    return Artefact("comparison", *CAPTIONS["ratios"], table)
+    return table
 
 
 def ratios_for_paper(table: pd.DataFrame) -> pd.DataFrame:
     """Return what a paper shows of `comparisons_of`: ratios to all keypoints of both errors."""
     rows = all_of(table[table["reference"] == "baseline"])
-    shown = table_of_ratios(rows).content
     columns = ["estimator", "keypoints", *comparisons.JUDGING_METRICS.values(), "failed runs"]
-    return shown.filter(columns)
+    return table_of_ratios(rows).filter(columns)
 
 
 def long_table_of_ratios(table: pd.DataFrame) -> Artefact:

@@ -48,7 +48,7 @@ def findings_of(
         fewest=verdicts.MIN_SEQUENCES,
         far=ratios.FAR_OFF,
         thesis_width=CONTROL_WIDTH,
-        ratios=style.markdown(comparison.table_of_ratios(rows).content),
+        ratios=style.markdown(comparison.table_of_ratios(rows)),
         spread=style.markdown(_shuffles(runs)),
         stability=style.markdown(_stability(runs)),
     )

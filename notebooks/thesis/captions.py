@@ -17,7 +17,7 @@ _CAPTIONS = json.loads(Path(__file__).with_suffix(".json").read_text(encoding="u
 # the 36 figures and 5 tables of the thesis in its order, {chapter: artefacts}
 CHAPTERS = _CAPTIONS["chapters"]
 _OF_STUDIES = {
-    ("figure", "comparison"): OF_STUDIES["figure"],
+    ("figure", "comparison"): OF_STUDIES["ratios_drawn"],
     ("table", "comparison"): OF_STUDIES["ratios"],
     ("table", "widths"): OF_STUDIES["widths"],
     ("text", "findings"): ("What the runs show", ""),

@@ -31,7 +31,7 @@ def of_the_thesis(metric=None):
 
 def all_pairs():
     rows = comparison.all_of(comparisons.comparisons_of(runs("runs")))
-    return comparison.table_of_ratios(rows).content
+    return comparison.table_of_ratios(rows)
 
 
 TABLES = {

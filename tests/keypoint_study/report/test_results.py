@@ -104,7 +104,7 @@ def test_failed_runs_are_counted():
         .loc["03", "failed runs"]
         == "1 of 3"
     )
-    compared = comparison.table_of_ratios(comparisons.comparisons_of(runs)).content
+    compared = comparison.table_of_ratios(comparisons.comparisons_of(runs))
     of_masks = compared[(compared["keypoints"] == "masks, width 10")].iloc[0]
     assert (
         of_masks["failed runs"] == "1 of 33"
@@ -195,7 +195,7 @@ def test_tables_for_a_paper_fit_a_column_and_have_caption_and_label(count):
 def test_ratios_in_the_tables_equal_the_comparison():
     runs = runs_of(ELEVEN, halved, noise=0.2)
     table = comparisons.comparisons_of(runs)
-    shown = comparison.table_of_ratios(comparison.all_of(table)).content
+    shown = comparison.table_of_ratios(comparison.all_of(table))
     assert len(shown) == 2 * (1 + 2 * len(CONTROLS))
     of_rmse = table[table["tested"] & (table["method"] != "baseline") & (table["metric"] == "rmse")]
     for row in of_rmse[of_rmse["reference"] == "baseline"].itertuples():
