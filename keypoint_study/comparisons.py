@@ -265,11 +265,12 @@ def tested_width(runs: pd.DataFrame) -> int | None:
     return int(widths[0])
 
 
-def keypoints_left(runs: pd.DataFrame) -> pd.Series:
-    """Return how many keypoints masks of the `tested_width` leave, or own code finds, by sequence.
+def keypoints_left(runs: pd.DataFrame, source: str) -> pd.Series:
+    """Return how many keypoints a source's masks leave, or its code finds, by sequence.
 
-    It is the mean of a source's runs.
+    It is the mean of its runs; of masks, those of the `tested_width`.
     """
+    runs = of_source(runs, source)
     brought = runs[runs["method"].isin(["masked", "keypoints"])]
     widths = brought["dilation_width"]
     rows = brought[widths.isna() | (widths == tested_width(runs))]

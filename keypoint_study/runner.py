@@ -331,7 +331,7 @@ def number_warnings(runs: pd.DataFrame, sources: Iterable[Source]) -> list[str]:
     """
     lines = []
     for source in sources:
-        wanted = comparisons.keypoints_left(comparisons.of_source(runs, source.name))
+        wanted = comparisons.keypoints_left(runs, source.name)
         of_source = runs[runs["source"] == source.name]
         for name in [name for name, method in METHODS.items() if method.as_many]:
             rows = of_source[of_source["method"] == name]
@@ -362,7 +362,7 @@ def keypoint_controls(
     """
     jobs: list[Job] = []
     for source in sources:
-        keypoints = comparisons.keypoints_left(comparisons.of_source(runs, source.name))
+        keypoints = comparisons.keypoints_left(runs, source.name)
         width_of_source = width if source.has_width else None
         for sequence in sequences:
             if sequence.name not in keypoints:  # its runs with masks failed

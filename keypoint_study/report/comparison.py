@@ -142,7 +142,7 @@ def _draw_ratios(
         inside = values[values == shown]
         ends = row[["low", "high"]].astype(float)
         panel.plot(inside, [y - 0.1] * len(inside), "o", alpha=0.45, **dot)
-        panel.plot(ends.clip(1 / reach, reach), [y + 0.2] * 2, **style.interval_style(color, "|"))
+        panel.plot(ends.clip(1 / reach, reach), [y + 0.2] * 2, **style.interval_style(color))
         panel.plot(row["ratio"], y + 0.2, "D", color=color, markersize=4, markeredgewidth=0)
         for edge, (marker, side) in edges.items():
             beyond = values[(shown == edge) & (values != shown)]

@@ -108,13 +108,12 @@ def line_style(index: int) -> dict[str, Any]:
     }
 
 
-def interval_style(color: str, cap: str) -> dict[str, Any]:
-    """Return the style of an interval with a cap at each end.
+def interval_style(color: str) -> dict[str, Any]:
+    """Return the style of an interval along x with a cap at each end.
 
     The caps are longer than the mark of the mean, so that an interval shorter than it is seen, too.
-    cap: "|" for an interval along x, "_" along y.
     """
-    return {"color": color, "linewidth": 1.8, "marker": cap, "markersize": 7}
+    return {"color": color, "linewidth": 1.8, "marker": "|", "markersize": 7}
 
 
 def label_colors(label_map: np.ndarray, frame: np.ndarray) -> np.ndarray:

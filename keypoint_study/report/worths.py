@@ -87,7 +87,7 @@ def figure_of_worths(
                 panel.plot(part.clip(1 / REACH, REACH), places, marker, **DOT)
             estimate, *interval = np.exp(ratios.typical_interval(np.log(values)))
             if not np.isnan(interval).any():
-                look = style.interval_style(style.MASKED, "|")
+                look = style.interval_style(style.MASKED)
                 panel.plot(np.clip(interval, 1 / REACH, REACH), [place + 0.2] * 2, **look)
             panel.plot(estimate, place + 0.2, "D", color=style.MASKED, markersize=4)
         style.ratio_rows(panel, order, REACH)

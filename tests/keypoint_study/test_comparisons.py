@@ -214,7 +214,7 @@ def test_the_tested_width_is_the_width_of_the_controls():
     assert comparisons.tested_width(runs_of({})) == 10
     # ready-made masks
     assert comparisons.tested_width(runs_of({"masked": 0.5}).assign(dilation_width=np.nan)) is None
-    assert (comparisons.keypoints_left(narrow) == 505).all()
+    assert (comparisons.keypoints_left(narrow, "") == 505).all()
     assert comparisons.tested_width(pd.concat([narrow, runs_of({"mirrored": 1.0}, width=7)])) == 10
 
 

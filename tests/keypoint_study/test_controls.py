@@ -188,7 +188,7 @@ def test_controls_leave_as_many_keypoints_as_masks_of_the_tested_width(
     jobs = first_jobs(opened, {"thesis": (5, WIDTH), "refined": ()}, tested=5)
     assert {job.dilation_width for job in jobs if job.method in methods.MASK_CONTROLS} == {5}
     runs = runner.run_all(runs_of(jobs, opened, [Source(small_labels)]), tmp_path).table
-    left = comparisons.keypoints_left(runs)
+    left = comparisons.keypoints_left(runs, "")
     masked = comparisons.of_method(runs, "masked")
     jobs += section_4_2.reduced_jobs(section_4_2.best_widths(masked))
     jobs += runner.keypoint_controls(runs, opened, [Source(small_labels)], 1, 5)
