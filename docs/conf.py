@@ -16,10 +16,7 @@ extensions = ["myst_nb"]
 if tags.has("reference"):  # noqa: F821 (Sphinx defines it; `make book` sets it)
     extensions.append("autoapi.extension")
 autoapi_dirs = [str(ROOT / package) for package in PACKAGES]
-suppress_warnings = [
-    "autoapi.python_import_resolution",  # of names that are set in pairs
-    "toc.empty_glob",  # the figures of the default run are the gallery
-]
+suppress_warnings = ["autoapi.python_import_resolution"]  # of names that are set in pairs
 autoapi_options = ["members", "show-inheritance", "show-module-summary"]
 include_patterns = ["**.md", "notebooks/*.ipynb", "autoapi/**"]
 exclude_patterns = ["docs/index.md"]  # it is index.md, too
@@ -47,6 +44,8 @@ def in_book(app, docname, source):
         for path in (CAPTIONS, __file__):
             app.env.note_dependency(path)
         source[0] = lesson(name, json.loads(source[0]))
+    elif docname == "index" and not Path(app.srcdir, "results").is_dir():
+        source[0] = source[0].replace("/results/README\n", "")  # the default run's is the gallery
     elif folder and not source[0].startswith("#"):  # a table or findings without a title
         title = name.replace("_", " ").capitalize()
         source[0] = f"---\norphan: true\n---\n# {title}\n\n{source[0]}"
