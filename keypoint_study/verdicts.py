@@ -16,7 +16,7 @@ MIN_SEQUENCES = 6
 
 LOWER, HIGHER = "lower", "higher"
 LESS, MORE, AS_MUCH = "less", "more", "as much"
-AS_GOOD, NO_WORSE, NOT_SHOWN = "as good", "no worse", "not shown to be"
+AS_GOOD, NO_WORSE, NEITHER = "as good", "no worse", "neither"
 NO_CLEAR_DIFFERENCE = "no clear difference"
 TOO_FEW = "too few sequences to tell"
 
@@ -49,7 +49,7 @@ WORTH = Rule(LESS, MORE, AS_MUCH, margins={"rotation": 1.25, "direction": 1.25})
 FEW_KEYPOINTS = Rule(
     within=AS_GOOD,
     under=NO_WORSE,
-    otherwise=NOT_SHOWN,
+    otherwise=NEITHER,
     margins={"se3": 1.25, "rotation": 1.1},
 )
 
