@@ -123,3 +123,12 @@ def test_the_recipes_for_what_people_bring_run(examples, tmp_path):
     first = cv2.imread("my-drive/000001.png", cv2.IMREAD_UNCHANGED)
     assert len(list((tmp_path / "my-drive").iterdir())) == len(images)
     assert first.ndim == 2 and first.dtype == np.uint8
+
+
+@pytest.mark.parametrize("path", [*TEXTS, ROOT / "CONTRIBUTING.md"], ids=lambda path: path.name)
+def test_code_that_texts_name_exists(path):
+    text = path.read_text(encoding="utf-8")
+    rooms = r"(?:tests|tools|keypoint_study|thesis_repro|notebooks|opencv_exact|street_world)"
+    named = re.findall(rf"`({rooms}/[\w./]+)`|(?<= )({rooms}/[\w./]+)`", text)
+    missing = [name for pair in named for name in pair if name and not (ROOT / name).exists()]
+    assert missing == []
