@@ -3,7 +3,7 @@
 A method chooses the keypoints of a run. Beside all keypoints and masks, there are *controls*: masks
 and settings that leave as many keypoints as the masks of the segmentation, chosen differently. If
 the odometry gains as much from a control, the segmentation is not what helps. A new method is a
-function and an entry in METHODS, a new error of a path one in errors.py.
+function and an entry in METHODS, a new error of a path one in path_errors.py.
 """
 
 from collections.abc import Callable, Mapping

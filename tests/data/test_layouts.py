@@ -79,6 +79,11 @@ def as_tum(folder, drive):
 LAYOUTS = {"own": as_kitti, "euroc": as_euroc, "rgbd": as_tum}
 
 
+def test_each_layout_has_a_writer_here():
+    written = len(LAYOUTS) + 1  # raw drives of KITTI are tested in test_kitti.py
+    assert written == len(layout.LAYOUTS)
+
+
 @pytest.fixture
 def street(tmp_path):
     """A rendered drive of twelve frames."""

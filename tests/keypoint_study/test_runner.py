@@ -199,6 +199,11 @@ def test_first_jobs_are_complete_and_have_different_names(small_world, tiny_kitt
     of_labels = {name for name, group in groups.items() if group == methods.LABEL_MAPS}
     controls = {name for name, group in groups.items() if group == methods.CONTROL}
     assert net == {"masked", *of_labels, *controls} - {"fewer", "spread"}
+    assert controls == {
+        *["other-frame", "mirrored", "random-lines", "image-edges", "fewer", "spread"]
+    }
+    of_masks = "exact-boundaries corrected static-boundaries static inverse true-labels"
+    assert of_labels == {*of_masks.split()}  # a new one joins every study only if it is meant to
     assert net - ready_made == of_labels
     without_truth = first_jobs([Sequence(tiny_kitti, "00")], {"thesis": (5,)}, tested=5)
     assert "true-labels" not in {job.method for job in without_truth}

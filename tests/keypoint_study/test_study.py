@@ -121,6 +121,8 @@ def test_figures_and_tables_of_a_study(done, study):
     ratios = pd.read_csv(folder / "ratios.csv")
     keys = ["source", "label", "reference_source", "reference", "metric", "estimator"]
     assert not ratios.duplicated(keys).any()
+    captions = re.findall("<figcaption><p><strong>.*?</strong>(.*?)</p>", page.read_text(), re.S)
+    assert len(captions) > 6 and all(len(caption.split()) > 3 for caption in captions)
     links = re.findall('(?:href|src)="([^"#]+)"', page.read_text())
     assert {"sources.webp", "paths-01.pdf", "errors.tex", "runs.csv"} <= set(links)
     assert all((folder / link).is_file() for link in links)

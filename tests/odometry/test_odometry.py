@@ -4,6 +4,7 @@ import json
 import pickle
 from dataclasses import dataclass, replace
 from fractions import Fraction
+from inspect import isfunction
 
 import cv2
 import numpy as np
@@ -200,9 +201,18 @@ def test_each_detector_finds_corners_in_columns_and_rows(name):
         assert_on_squares(lambda *arguments: detector(*arguments)[:, ::-1])
 
 
-def test_no_limit_is_none_for_every_detector(drive):
-    for find in (detect, keypoints.orb):
-        assert len(find(drive.frame(0), replace(THESIS, max_keypoints=0))) > 2000
+WITHOUT_NUMBER = [detect, *(each for each in keypoints.DETECTORS.values() if isfunction(each))]
+
+
+@pytest.mark.parametrize("find", WITHOUT_NUMBER, ids=lambda find: find.__name__)
+def test_each_detector_keeps_to_limit_and_mask(drive, find):
+    frame = drive.frame(0)
+    assert len(find(frame, replace(THESIS, max_keypoints=0))) > 2000
+    assert 0 < len(find(frame, replace(THESIS, max_keypoints=50))) <= 50
+    mask = np.zeros(frame.shape, np.uint8)
+    mask[:, :200] = 255
+    points = find(frame, THESIS, mask)
+    assert len(points) and (points[:, 0] < 200.5).all()
 
 
 def test_keypoints_that_cannot_be_pixels_are_refused(drive):
