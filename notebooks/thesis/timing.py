@@ -33,8 +33,8 @@ WARM_UP = 3  # frames before them, which load compiled code and fill caches
 def seconds_of(sequence: Sequence, masks: Masks | None = None) -> float:
     """Return the seconds that the odometry and its masks take in a run of its own, on one thread.
 
-    The runs of `study.runner` share work, so none of them can be timed. The first two steps load
-    code and are not counted; nor are frames' files and the network, as in Section 4.2.
+    The runs of `keypoint_study.runner` share work, so none of them can be timed. The first two
+    steps load code and are not counted; nor are frames' files and the network, as in Section 4.2.
     """
     cv2.setNumThreads(1)
     seconds = []
