@@ -318,6 +318,7 @@ def worths_of(
         )
         calls.append((stage / "worth.csv", sequence, chosen, own))
     missing = [call for call in calls if not call[0].is_file()]
+    missing.sort(key=lambda call: -len(call[1]))  # so that no process waits long for the last one
     # the first step of a sequence compiles, so it says nothing about the time of the others
     steps = [min(len(sequence), MAX_STEPS) for _, sequence, *_ in missing]
     reasons = []

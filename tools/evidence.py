@@ -3,9 +3,11 @@
 `make evidence KITTI=...` runs `make figures PROFILE=thesis` with all sequences of a KITTI folder
 and the label maps of the model in the package. Then this program copies the tables, the runs and
 the figures that show no frame of the data. It adds what the streets show, few keypoints, the worth
-of a keypoint, and the refined estimator with masks of every width. A stopped run resumes.
+of a keypoint, and the refined estimator with masks of every width. It says what is left. A stopped
+run resumes.
 """
 
+import time
 from pathlib import Path
 
 import numpy as np
@@ -41,10 +43,13 @@ STREETS = {
     "00": "a residential street with parked cars",
     "01": "a ramp onto a motorway",
     "02": "a main road, then a turn into a road between trees",
+    "03": "a residential street between trees, up to a junction",
+    "04": "a main road out of a town, behind a van",
     "05": "a residential street with few parked cars",
     "06": "a straight street past a building site, with parked cars",
     "07": "a street of a town with shops and parked cars",
     "drive0005": "a town; a van and a cyclist move ahead, a pedestrian crosses",
+    "drive0009": "a street past shops, with parked cars",
     "drive0095": "a residential street with parked cars",
 }
 
@@ -65,21 +70,30 @@ def write(settings, folder):
     lengths = ", ".join(f"{sequence.name} ({len(sequence)} frames)" for sequence in sequences)
     note = f"odometry: real KITTI frames, {lengths}; label maps by the model in the package"
     few_folder = settings.build / "few_keypoints"
-    few_runs = few_keypoints.run_few(
-        sequences, labels, few_folder, settings.jobs, few_keypoints.REPETITIONS
-    )
+    parts = {
+        "few keypoints": lambda: few_keypoints.run_few(
+            sequences, labels, few_folder, settings.jobs, few_keypoints.REPETITIONS
+        ),
+        "their times": lambda: few_keypoints.time_steps(sequences[0], labels, few_folder),
+        "worth of a keypoint": lambda: worth.worths_of(
+            sequences,
+            [Source(labels)],
+            jobs.CONTROL_WIDTH,
+            settings.build / "worth",
+            (worth.DECIDING, 0, 200, 100),
+            settings.jobs,
+            named=tuple(EXPLORED),
+        ),
+        "refined estimator, every width": lambda: runs_of_widths(settings, sequences, labels),
+    }
+    made = []
+    for place, (name, make) in enumerate(parts.items()):
+        print(f"left: {'; '.join(list(parts)[place:])}", flush=True)
+        started = time.monotonic()
+        made.append(make())
+        print(f"{name}: done in {time.monotonic() - started:.0f} s", flush=True)
+    few_runs, times, worths, of_widths = made
     few = few_keypoints.ratios_to_all(few_runs)
-    times = few_keypoints.time_steps(sequences[0], labels, few_folder)
-    worths = worth.worths_of(
-        sequences,
-        [Source(labels)],
-        jobs.CONTROL_WIDTH,
-        settings.build / "worth",
-        (worth.DECIDING, 0, 200, 100),
-        settings.jobs,
-        named=tuple(EXPLORED),
-    )
-    of_widths = runs_of_widths(settings, sequences, labels)
     streets = _streets(sequences)
     provenance.sweep(folder)
     for name in KEPT:

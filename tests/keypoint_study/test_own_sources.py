@@ -27,7 +27,8 @@ T = np.arange(12) / 10  # times of the frames
 @pytest.fixture
 def street(tmp_path, monkeypatch):
     """A root with the street of noise as sequences 00 and 01, and one mask for all frames."""
-    monkeypatch.setattr(worth, "MAX_STEPS", 1)  # the worth takes longest, and is tested elsewhere
+    for name in ("MAX_STEPS", "SPLITS", "FITS"):  # the worth takes longest; it has its own tests
+        monkeypatch.setattr(worth, name, 1)
     street, root = Street(12), tmp_path / "kitti"
     projection = np.column_stack([street.intrinsics, np.zeros(3)]).ravel().tolist()
     for name in ("00", "01"):

@@ -12,7 +12,7 @@ import pytest
 import trials
 from evo.tools import file_interface
 
-from keypoint_study import runner
+from keypoint_study import runner, worth
 from keypoint_study.plan import Study
 from keypoint_study.report import study_report as report
 from keypoint_study.sources import Source
@@ -25,6 +25,15 @@ from thesis_repro.masks.folders import LabelMasks, write_masks
 from thesis_repro.running.files import write_png
 
 FRAMES = 4
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_splits():
+    """The worth takes longest; it has its own tests."""
+    with pytest.MonkeyPatch.context() as patched:
+        for name in ("SPLITS", "FITS"):
+            patched.setattr(worth, name, 1)
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ whose workers died.)
 import logging
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, wait
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from threading import RLock
 from typing import Any, NamedTuple
 
@@ -59,6 +59,16 @@ def _begin() -> None:
 
 
 @contextmanager
+def _closed(client: Any) -> Iterator[None]:
+    """Close a client of Dask at the end; this fails now and then if its scheduler has ended."""
+    try:
+        yield
+    finally:
+        with suppress(RuntimeError, OSError, TimeoutError):
+            client.close()
+
+
+@contextmanager
 def open_pool(processes: int, scheduler: str | None = None) -> Iterator[Pool]:
     """Open a pool on a Dask scheduler or, without one, on processes of this machine.
 
@@ -80,7 +90,8 @@ def open_pool(processes: int, scheduler: str | None = None) -> Iterator[Pool]:
         return
     from dask.distributed import Client, KilledWorker  # imported here because it takes a second
 
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # workers may come and go
+    for name in ("distributed", "distributed.client"):  # workers and the scheduler may come and go
+        logging.getLogger(name).setLevel(logging.CRITICAL)
     try:
         client = Client(scheduler, timeout=TIMEOUT, set_as_default=False)
     except (OSError, ValueError, ImportError) as error:
@@ -88,7 +99,7 @@ def open_pool(processes: int, scheduler: str | None = None) -> Iterator[Pool]:
             f"Dask scheduler {scheduler}: does not answer ({type(error).__name__}); start one with "
             "'dask scheduler' and give the address that it prints, tcp://host:port"
         ) from None
-    with client:
+    with _closed(client):
         size = sum(client.nthreads().values())
         if not size:
             raise InputError(
