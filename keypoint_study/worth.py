@@ -80,12 +80,14 @@ def worth_of(
     chosen: Choices,
     calls: Mapping[str, Calls] = {},
     splits: int | None = None,
+    steps: int | None = None,
 ) -> pd.DataFrame:
     """Return what a keypoint of each choice is worth on a sequence.
 
     chosen: {(name, number): (settings, masks)}, as for `odometry.run_many`; so many keypoints are
     drawn from those that the settings and the masks leave, 0 for all of them. calls: of choices
-    with own keypoints, by name. splits: of each kind, SPLITS if not given.
+    with own keypoints, by name. splits: of each kind, SPLITS if not given. steps: at most
+    so many, at equal distances, MAX_STEPS if not given.
 
     One row a choice, number and split ("fields", "points", or ONE_FIT): sequence, choice, number,
     split, steps; keypoints, the median number that was drawn; left, the median number that the
@@ -95,17 +97,17 @@ def worth_of(
     """
     for _, masks in chosen.values():
         check(sequence, masks)
-    steps = np.flatnonzero(sequence.scales[1:] >= metrics.MIN_DIRECTED_STEP)
-    if not len(steps):
+    long_enough = np.flatnonzero(sequence.scales[1:] >= metrics.MIN_DIRECTED_STEP)
+    if not len(long_enough):
         raise InputError(
             f"sequence {sequence.name}: no step of {metrics.MIN_DIRECTED_STEP} m or more, and shorter ones "
             "do not show what a keypoint is worth"
         )
-    spaced = np.linspace(0, len(steps) - 1, min(len(steps), MAX_STEPS))
-    steps = steps[spaced.round().astype(int)]
+    taken = min(len(long_enough), steps or MAX_STEPS)
+    indices = long_enough[np.linspace(0, len(long_enough) - 1, taken).round().astype(int)]
     shared = SharedCalls()
     rows = []
-    for index in steps:
+    for index in indices:
         random, of_choices = tracked(sequence, int(index), chosen, shared, calls)
         halves_of_random = cache(partial(_halves, random))
         for (name, number), tracks in of_choices.items():
@@ -127,7 +129,7 @@ def worth_of(
         ["keypoints", "left", *MOTIONS, *(f"{name}_deg" for name in MOTIONS)]
     ].reset_index()
     table.insert(0, "sequence", sequence.name)
-    table.insert(4, "steps", len(steps))
+    table.insert(4, "steps", len(indices))
     return table
 
 

@@ -130,16 +130,17 @@ def test_verdicts_need_both_splits_and_both_motions():
     assert verdict(near_one[:5] - 0.7) == verdicts.TOO_FEW
 
 
-def test_error_rates_of_the_verdicts_by_chance():
-    """Eight streets that differ by 30 %; worths of one street are correlated by 0.5."""
+@pytest.mark.parametrize("streets", [8, 11])
+def test_error_rates_of_the_verdicts_by_chance(streets):
+    """Streets that differ by 30 %; worths of one street are correlated by 0.5."""
     random = np.random.default_rng(0)
 
     def words(centre):
-        spread = random.normal(0, 0.3 * np.sqrt(0.5), (200, 8, 1))
-        spread = spread + random.normal(0, 0.3 * np.sqrt(0.5), (200, 8, 4))
+        spread = random.normal(0, 0.3 * np.sqrt(0.5), (200, streets, 1))
+        spread = spread + random.normal(0, 0.3 * np.sqrt(0.5), (200, streets, 4))
         names = [f"{motion}_{split}" for split in worth.SPLIT for motion in worth.MOTIONS]
-        streets = [pd.DataFrame(each + centre, columns=names) for each in spread]
-        return [worth._verdict(dict(of_study.items())) for of_study in streets]
+        studies = [pd.DataFrame(each + centre, columns=names) for each in spread]
+        return [worth._verdict(dict(of_study.items())) for of_study in studies]
 
     wrong = [each in (verdicts.LESS, verdicts.MORE) for each in words(0)]
     assert np.mean(wrong) < 0.03

@@ -11,8 +11,11 @@ from executing import run_of
 import bench
 import evidence
 import train_shipped
+from keypoint_study import jobs, runner, worth
+from keypoint_study.sources import Source
 from thesis.settings import read_settings
 from thesis_repro.data.kitti import Sequence
+from thesis_repro.segmentation import prediction
 
 pytestmark = pytest.mark.slow
 
@@ -78,6 +81,30 @@ def test_evidence_keeps_what_shows_no_frame(executed, tmp_path, monkeypatch):
     assert {path.stem for path in out.iterdir()} == names
     streets = pd.read_csv(out / "streets.csv")
     assert (streets["frames"] == 5).all() and (streets["metres"] > 0).all()
+
+
+@pytest.mark.torture
+@pytest.mark.parametrize("street", ["04"])
+def test_a_street_gives_the_evidence_in_git(kitti_real, tmp_path, street):
+    """From its frames: label maps, runs of both estimators, the worth of masks and random ones."""
+    sequence = Sequence(kitti_real, street)
+    folder = tmp_path / "labels" / street
+    prediction.write_label_maps(prediction.load_shipped(), sequence.frame_paths, folder, 16)
+    source = Source(folder.parent)
+    planned = [
+        jobs.Job(street, method, width, estimator=estimator, repetition=repetition)
+        for method, width in (("baseline", None), ("masked", 10))
+        for estimator in ("thesis", "refined")
+        for repetition in (0, 1)
+    ]
+    runs = runner.run_all(jobs.runs_of(planned, [sequence], [source]), tmp_path / "runs").table
+    chosen = worth.choices_of(sequence, [source], 10)
+    asked = {key: chosen[key] for key in chosen if key[0] in ("random keypoints", "masks")}
+    for name, made in ("runs", runs), ("worth_runs", worth.worth_of(sequence, asked)):
+        text = made.to_csv(index=False, lineterminator="\n", float_format="%.6g")
+        whole = (evidence.FOLDER / f"{name}.csv").read_text(encoding="utf-8").splitlines()
+        head, *rows = text.splitlines()
+        assert head == whole[0] and len(rows) >= 6 and set(rows) <= set(whole)
 
 
 def test_a_sweep_has_one_row_a_width():
