@@ -9,6 +9,7 @@ from importlib import metadata
 from pathlib import Path
 
 import pytest
+import yaml
 from packaging.requirements import Requirement
 from trials import PACKAGES, copy_project, refused, run, snapshot, succeed
 
@@ -30,6 +31,12 @@ def test_the_lock_has_a_version_of_every_requirement_in_its_range():
         assert requirement.specifier.contains(metadata.version(requirement.name)), requirement
 
 
+def test_a_release_has_one_version():
+    cited = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    changes = re.findall(r"^## (.*)$", (ROOT / "CHANGELOG.md").read_text(), re.M)
+    assert cited["version"] == PROJECT["version"] == changes[0]
+
+
 def uv(*words):
     words = [UV, *words, "--quiet", "--system-certs"]
     result = subprocess.run(list(map(str, words)), capture_output=True, text=True)
@@ -42,7 +49,7 @@ def uv(*words):
 def wheel(tmp_path_factory):
     """It is built from a copy, because building leaves files beside what it is built from."""
     folder = tmp_path_factory.mktemp("source")
-    copy_project([*PACKAGES, "pyproject.toml", "LICENSE"], folder)
+    copy_project([*PACKAGES, "pyproject.toml", "README.md", "LICENSE"], folder)
     build = ("build", "--wheel", "--no-build-isolation", "--python", sys.executable)
     uv(*build, "--out-dir", folder / "dist", folder)
     return next((folder / "dist").glob("*.whl"))
