@@ -125,6 +125,15 @@ def test_the_recipes_for_what_people_bring_run(examples, tmp_path):
     assert first.ndim == 2 and first.dtype == np.uint8
 
 
+def test_the_changelog_has_one_release_and_short_items():
+    text = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    (release,) = re.findall(r"^## .*", text, re.MULTILINE)
+    section = text.partition(release)[2]
+    assert len(re.sub(r"^- ", "", section, flags=re.MULTILINE).split()) <= 300
+    items = re.findall(r"^- (.*)", section, re.MULTILINE)
+    assert [item for item in items if len(item.split()) > 30] == []
+
+
 @pytest.mark.parametrize("path", [*TEXTS, ROOT / "CONTRIBUTING.md"], ids=lambda path: path.name)
 def test_code_that_texts_name_exists(path):
     text = path.read_text(encoding="utf-8")
