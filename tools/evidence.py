@@ -98,6 +98,7 @@ def write(settings, folder):
     provenance.sweep(folder)
     for name in KEPT:
         _copy(settings.figures, name, folder)
+    (folder / "audit.md").unlink()  # the page beside the gallery has its numbers, too
     style.save_figure(few_keypoints.figure_of_few(few), folder, "few_keypoints", note)
     told = worths[~worths["choice"].isin([method.title for method in EXPLORED.values()])]
     for artefact in (report_worths.figure_of_worths(told), report_worths.table_of_worths(told)):

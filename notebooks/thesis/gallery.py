@@ -8,7 +8,7 @@ from typing import Any
 import pandas as pd
 
 from keypoint_study.report import texts
-from thesis import captions, timing
+from thesis import audit_page, captions, timing
 from thesis.reported import REPORTED
 from thesis.settings import ROOT, Settings, read_settings
 from thesis_repro.running import program, provenance
@@ -46,8 +46,20 @@ def _drawn(settings: Settings) -> dict[Path, Path]:
 
 
 def write(settings: Settings) -> None:
-    """Write the gallery beside the published figures of a run."""
+    """Write the gallery beside the published figures of a run.
+
+    In git, the audit's page has the numbers of real frames, too.
+    """
+    audits = [settings.published / place / "audit.csv" for place in (".", REAL)]
+    if settings.figures_in_git and all(path.is_file() for path in audits):
+        write_text(settings.published / "audit.md", audit(settings))
     write_text(settings.published / "README.md", text(settings))
+
+
+def audit(settings: Settings) -> str:
+    """Return the audit's page in git, made from the published tables."""
+    folder = settings.published
+    return audit_page.text(folder, folder / REAL, settings.data_note)
 
 
 def text(settings: Settings) -> str:
@@ -146,7 +158,7 @@ def _table(path: Path) -> pd.DataFrame:
 
 
 def main() -> None:
-    """Write the gallery anew from published figures, by default those in git."""
+    """Write the gallery anew from published files, by default those in git."""
     write(read_settings())
 
 
