@@ -25,13 +25,15 @@ from joblib import cpu_count
 LONGEST = (
     "test_executed.py",
     "test_training.py",
-    "test_exercises.py",
     "test_prediction.py",
     "test_dask.py",
     "test_odometry.py",
     "test_study.py",
     "test_own_sources.py",
     "test_runner.py",
+    # these need what the first one executes, and would wait for it
+    "test_exercises.py",
+    "test_book.py",
     "test_tools.py",
 )
 # fixtures that take seconds

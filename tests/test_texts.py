@@ -11,7 +11,13 @@ from thesis_repro.odometry import metrics
 
 
 @pytest.mark.parametrize(
-    "template, words", [("README.md.j2", 900), ("answer.md.j2", 1200), ("options.md.j2", 1800)]
+    "template, words",
+    [
+        ("README.md.j2", 900),
+        ("answer.md.j2", 1200),
+        ("reading-results.md.j2", 2600),
+        ("options.md.j2", 1800),
+    ],
 )
 def test_texts_in_git_are_those_of_the_tables_and_short(template, words):
     written = write_texts.WRITTEN[template].read_text(encoding="utf-8")
@@ -49,8 +55,9 @@ def with_masks(monkeypatch):
 def test_texts_say_every_outcome_of_the_runs(with_masks, factor, streets, outcome):
     with_masks(factor, streets)
     assert write_texts.verdict() == outcome
-    for template in ("README.md.j2", "answer.md.j2"):
-        assert f"errors are {write_texts.ERRORS[outcome]} those" in write_texts.render(template)
+    readme, answer = map(write_texts.render, ("README.md.j2", "answer.md.j2"))
+    assert f"masks are {write_texts.ERRORS[outcome]} those" in readme
+    assert write_texts.PATHS[outcome] in answer
 
 
 @pytest.mark.real

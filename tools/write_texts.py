@@ -8,6 +8,7 @@ import re
 from functools import cache
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from keypoint_study import comparisons, ratios, verdicts
@@ -22,7 +23,9 @@ from thesis_repro.running.files import write_text
 
 TEMPLATES = ROOT / "docs" / "templates"
 WRITTEN = {"README.md.j2": ROOT / "README.md"}
-WRITTEN |= {f"{name}.md.j2": ROOT / f"docs/{name}.md" for name in ("answer", "options")}
+WRITTEN |= {
+    f"{name}.md.j2": ROOT / f"docs/{name}.md" for name in ("answer", "reading-results", "options")
+}
 REAL = "kitti_excerpts/"  # tables on real frames
 # how the texts say a verdict on the worth of a keypoint, and on errors
 TOO_FEW = "of too few streets to be compared with"
@@ -38,6 +41,13 @@ ERRORS = {
     verdicts.HIGHER: "higher than",
     verdicts.NO_CLEAR_DIFFERENCE: "not clearly different from",
     verdicts.TOO_FEW: TOO_FEW,
+}
+# the same in words for everybody
+PATHS = {
+    verdicts.LOWER: "made a camera's path more accurate",
+    verdicts.HIGHER: "made a camera's path less accurate",
+    verdicts.NO_CLEAR_DIFFERENCE: "made a camera's path neither clearly more nor less accurate",
+    verdicts.TOO_FEW: "was tried on too few streets",
 }
 NAMES = ("sequence", "row", "source", "metric", "estimator")  # columns of texts, if empty, too
 
@@ -90,13 +100,61 @@ def of_controls() -> list[str]:
     return [verdict(over=name) for name in comparisons.SEGMENTATION_FREE_CONTROLS]
 
 
+def by_chance(estimator: str = "thesis") -> pd.Series:
+    """Return the highest RMSE over the lowest of shuffled runs with all keypoints, by street."""
+    rows = ratios.range_of_shuffles(read_table(f"{REAL}runs"))
+    return rows.loc[rows["estimator"] == estimator, "factor"]
+
+
 def worth(choice: str, motion: str, split: str = "fields", where: str = "") -> dict[str, Any]:
-    """Return ratio, low, high, below, n and verdict of the worth of one of 400 keypoints."""
-    rows = read_table(f"{REAL}worth_runs").query("number == 400 and choice == @choice")
+    """Return ratio, low, high, below, n and verdict of the worth of one of 400 keypoints.
+
+    choice: as in the tables, or two, "masks / beside the masks", for the one divided by the other.
+    where: which streets. of_fit: the verdict of the second measure. Without `where`, a verdict that
+    new streets do not share is no clear difference (docs/reading-results.md).
+    """
+    rows = read_table(f"{REAL}worth_runs").query("number == 400")
+    first, _, other = choice.partition(" / ")
+    rows = worths.over(rows, first, other) if other else rows.query("choice == @choice")
     (row,) = worths.typical_worths(rows.query(where) if where else rows).to_dict("records")
     name = f"{motion}_{split}"
     ends = {end: row[f"{name}_{end}"] for end in ("low", "high", "below")}
-    return {"ratio": row[name], **ends, "n": row["n"], "verdict": row["verdict"]}
+    told = row["verdict"]
+    is_told = told in (verdicts.LESS, verdicts.MORE) and not (where or other)
+    if is_told and new_streets_disagree(choice):
+        told = verdicts.NO_CLEAR_DIFFERENCE
+    of_fit = row.get("verdict_of_fit")
+    return {"ratio": row[name], **ends, "n": row["n"], "verdict": told, "of_fit": of_fit}
+
+
+def new_streets() -> str:
+    """Return the condition of the streets on which nothing was chosen."""
+    return f"sequence in {sorted(set(read_table(f'{REAL}new_streets')['sequence']))}"
+
+
+def new_streets_disagree(choice: str) -> bool:
+    """Whether two of the new streets lie on the other side of 1 than the others, by fields."""
+    rows = read_table(f"{REAL}worth_runs").query("number == 400 and split == 'fields'")
+    rows = rows.query("choice == @choice")
+    new, others = rows.query(new_streets()), rows.query(f"not ({new_streets()})")
+    for motion in worths.MOTIONS:
+        typical = ratios.typical_interval(np.log(others[motion]))[0]
+        if (np.sign(np.log(new[motion])) == -np.sign(typical)).sum() >= 2:
+            return True
+    return False
+
+
+def on_new_streets(choice: str, motion: str) -> str:
+    """Return the worths of a choice on each of the new streets, by fields: "0.31, 0.40, 0.52"."""
+    rows = read_table(f"{REAL}new_streets").query("choice == @choice")
+    return ", ".join(map(two, rows[motion]))
+
+
+def left_out(outcome: str) -> list[str]:
+    """Return the names of classes without which random keypoints have a verdict."""
+    rows = read_table(f"{REAL}left_out")
+    named = rows.loc[rows["a keypoint tells"] == outcome, "choice"]
+    return [name.removeprefix("without ") for name in named]
 
 
 def few(
@@ -161,7 +219,7 @@ def with_interval(row: dict[str, Any]) -> str:
 def render(template: str) -> str:
     """Return the text that a template in docs/templates gives."""
     named = {function.__name__: function for function in FUNCTIONS}
-    return texts.render(template, **named, tells=TELLS, errors=ERRORS)
+    return texts.render(template, **named, tells=TELLS, errors=ERRORS, paths=PATHS)
 
 
 # that templates call
@@ -172,7 +230,11 @@ FUNCTIONS = (
     error,
     verdict,
     of_controls,
+    by_chance,
     worth,
+    new_streets_disagree,
+    on_new_streets,
+    left_out,
     few,
     of_few,
     audit,
