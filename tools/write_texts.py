@@ -127,6 +127,20 @@ def worth(choice: str, motion: str, split: str = "fields", where: str = "") -> d
     return {"ratio": row[name], **ends, "n": row["n"], "verdict": told, "of_fit": of_fit}
 
 
+def stay_without_any() -> bool:
+    """Whether the verdicts on errors with masks, and on the worth, stay without any one street."""
+    few_methods = "method in ('baseline', 'masked') and estimator == 'refined'"
+    found = set()
+    for street in ["", *read_table(f"{REAL}streets")["sequence"]]:
+        others = f"sequence != '{street}'"
+        where = f"{others} and {few_methods}"
+        rows = [error(metric, where=where) for metric in comparisons.JUDGING_METRICS]
+        chosen = ("masks", "spread keypoints")
+        told = [worth(choice, "direction", where=others)["verdict"] for choice in chosen]
+        found.add((comparisons.verdict_of(pd.DataFrame(rows)), *told))
+    return len(found) == 1
+
+
 def new_streets() -> str:
     """Return the condition of the streets on which nothing was chosen."""
     return f"sequence in {sorted(set(read_table(f'{REAL}new_streets')['sequence']))}"
@@ -232,6 +246,8 @@ FUNCTIONS = (
     of_controls,
     by_chance,
     worth,
+    stay_without_any,
+    new_streets,
     new_streets_disagree,
     on_new_streets,
     left_out,
