@@ -106,14 +106,16 @@ def by_chance(estimator: str = "thesis") -> pd.Series:
     return rows.loc[rows["estimator"] == estimator, "factor"]
 
 
-def worth(choice: str, motion: str, split: str = "fields", where: str = "") -> dict[str, Any]:
-    """Return ratio, low, high, below, n and verdict of the worth of one of 400 keypoints.
+def worth(
+    choice: str, motion: str, split: str = "fields", where: str = "", number: int = 400
+) -> dict[str, Any]:
+    """Return ratio, low, high, below, n and verdict of the worth of one of so many keypoints.
 
     choice: as in the tables, or two, "masks / beside the masks", for the one divided by the other.
     where: which streets. of_fit: the verdict of the second measure. Without `where`, a verdict that
     new streets do not share is no clear difference (docs/reading-results.md).
     """
-    rows = read_table(f"{REAL}worth_runs").query("number == 400")
+    rows = read_table(f"{REAL}worth_runs").query("number == @number")
     first, _, other = choice.partition(" / ")
     rows = worths.over(rows, first, other) if other else rows.query("choice == @choice")
     (row,) = worths.typical_worths(rows.query(where) if where else rows).to_dict("records")
