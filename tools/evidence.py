@@ -100,7 +100,7 @@ def write(settings, folder):
         _copy(settings.figures, name, folder)
     (folder / "audit.md").unlink()  # the page beside the gallery has its numbers, too
     style.save_figure(few_keypoints.figure_of_few(few), folder, "few_keypoints", note)
-    told = worths[~worths["choice"].isin([method.title for method in EXPLORED.values()])]
+    told = not_explored(worths)
     for artefact in (report_worths.figure_of_worths(told), report_worths.table_of_worths(told)):
         style.save(artefact, folder, note)
     for_readers = {
@@ -182,6 +182,11 @@ def table_of_widths(runs):
             row[title] = f"{texts.short(ratio)}, {ratio['above']} of {ratio['n']} above 1"
         rows.append(row | {"failed runs": ratios.count_failed(of_width)})
     return pd.DataFrame(rows)
+
+
+def not_explored(worths):
+    """Return the worths of the choices that every study has."""
+    return worths[~worths["choice"].isin([method.title for method in EXPLORED.values()])]
 
 
 def table_of_places(worths):
