@@ -73,6 +73,7 @@ def start(command, where, before=None, **changes):
         preexec_fn=before,
         start_new_session=True,
         text=True,
+        errors="surrogateescape",
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
     )

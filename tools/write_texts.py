@@ -6,6 +6,7 @@ row of a table, and writes its numbers. Its only conditions are the outcomes of 
 
 import re
 from functools import cache
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -129,6 +130,16 @@ def worth(
     return {"ratio": row[name], **ends, "n": row["n"], "verdict": told, "of_fit": of_fit}
 
 
+def random_apart(number: int) -> list[str]:
+    """Return which worths of random keypoints have an interval without 1: the check of the rule."""
+    apart = []
+    for motion, split in product(worths.MOTIONS, worths.SPLIT):
+        row = worth("random keypoints", motion, split, number=number)
+        if ratios.side_of_one(row["low"], row["high"]):
+            apart.append(f"{motion} by {split}, {with_interval(row)}")
+    return apart
+
+
 def stay_without_any() -> bool:
     """Whether the verdicts on errors with masks, and on the worth, stay without any one street."""
     few_methods = "method in ('baseline', 'masked') and estimator == 'refined'"
@@ -248,6 +259,7 @@ FUNCTIONS = (
     of_controls,
     by_chance,
     worth,
+    random_apart,
     stay_without_any,
     new_streets,
     new_streets_disagree,

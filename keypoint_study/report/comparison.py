@@ -77,13 +77,11 @@ def figure_of_ratios(table: pd.DataFrame, source: str = "", width: float = PAGE_
     """
     name, (title, caption) = "comparison", CAPTIONS["ratios_drawn"]
     if source:
-        table = table[table["source"].isin([source, ""])]
         name, title = f"comparison-{source}", f"{title} of {source}"
-    rows = _drawn(table)
-    rows = rows[rows["metric"].isin(comparisons.JUDGING_METRICS)]
+    rows = judged(table, source)
     is_wide = width > COLUMN_WIDTH
     if not is_wide:
-        rows = rows[rows["estimator"].isin(rows.loc[rows["decides"], "estimator"])]
+        rows = rows[rows["estimator"] == comparisons.judging_estimator(rows)]
     sequences = comparisons.sequences_of(table)
     orders = {name: list(part["label"].unique()) for name, part in rows.groupby("estimator")}
     estimators = [name for name in ESTIMATORS if name in orders]
@@ -154,6 +152,14 @@ def _draw_ratios(
                 panel.plot(edge, y + 0.2, marker, color=color, markersize=5, clip_on=False)
     style.ratio_rows(panel, order, reach)
     panel.tick_params(labelsize=7)
+
+
+def judged(table: pd.DataFrame, source: str = "") -> pd.DataFrame:
+    """Return the rows of `figure_of_ratios`: none if no error that decides has a ratio."""
+    if source:
+        table = table[table["source"].isin([source, ""])]
+    rows = _drawn(table)
+    return rows[rows["metric"].isin(comparisons.JUDGING_METRICS)]
 
 
 def _drawn(table: pd.DataFrame) -> pd.DataFrame:

@@ -107,11 +107,10 @@ def figures_of(
 
     table: `comparisons_of` the runs.
     """
-    yield comparison.figure_of_ratios(table, width=width)
     controlled = table[table["method"].isin(comparisons.SEGMENTATION_FREE_CONTROLS)]
     masked = table.loc[table["method"] == "masked", "source"].unique()
-    if len(masked) > 1:
-        for source in controlled["source"].unique():
+    for source in ["", *(controlled["source"].unique() if len(masked) > 1 else [])]:
+        if not comparison.judged(table, source).empty:
             yield comparison.figure_of_ratios(table, source, width)
     if runs["method"].isin(DRAWN).any():
         yield figure_of_sources(study, runs, width)

@@ -16,7 +16,7 @@ from thesis_repro.data.memory import FRAME_TIME, ArraySequence, distances, step_
 from thesis_repro.data.trajectories import read_truth
 from thesis_repro.errors import InputError
 from thesis_repro.running import provenance
-from thesis_repro.running.files import read_gray
+from thesis_repro.running.files import read_gray, read_unchanged
 
 TRUE_LABELS = "labels_0"  # exact label maps beside image_0, which only the embedded world has
 # Pixels near a border where keypoints are left out: half a window of the tracker, which would see
@@ -270,7 +270,7 @@ class Sequence:
         """
         hidden = np.zeros(self.size, bool) if self.border is None else self.border.copy()
         if self._has_alpha:
-            pixels = cv2.imread(str(self.frame_paths[index]), cv2.IMREAD_UNCHANGED)
+            pixels = read_unchanged(self.frame_paths[index])
             if pixels.ndim == 3 and pixels.shape[2] == 4:
                 hidden |= self.undistorted((pixels[..., 3] == 0).astype(np.uint8)) > 0
         if self.distortion.any():
@@ -282,8 +282,8 @@ class Sequence:
 
     @cached_property
     def _has_alpha(self) -> bool:
-        pixels = cv2.imread(str(self.frame_paths[0]), cv2.IMREAD_UNCHANGED)
-        return pixels is not None and pixels.ndim == 3 and pixels.shape[2] == 4
+        pixels = read_unchanged(self.frame_paths[0])
+        return pixels.ndim == 3 and pixels.shape[2] == 4
 
     def without_border(self) -> "Sequence":
         """Copy without keypoints in parts that are black in all frames, nor close to them.

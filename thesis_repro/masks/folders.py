@@ -23,7 +23,7 @@ from thesis_repro.masks import (
 )
 from thesis_repro.running import provenance
 from thesis_repro.running.code_used import digest_of_code
-from thesis_repro.running.files import listed, progress, read_gray, write_png
+from thesis_repro.running.files import listed, progress, read_unchanged, write_png
 
 ENDINGS = (".png", ".jpg", ".jpeg")  # of masks, in small or capital letters
 AREA = np.ones((5, 5), np.uint8)  # gray edges are narrower than one of a single gray value
@@ -158,10 +158,7 @@ def read_mask(
     Raises InputError for another size, for a picture with an alpha channel, and if it is not plain
     which values are meant: areas of gray, as of a label map or of several objects.
     """
-    pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    if pixels is None:
-        return read_gray(path)  # raises the error that says why
-    mask = pixels
+    mask = pixels = read_unchanged(path)
     if pixels.ndim == 3:
         mask = pixels[..., :3].max(axis=2)
         alpha = pixels[..., 3:]

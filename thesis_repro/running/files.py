@@ -41,6 +41,14 @@ def read_color(path: str | Path, largest: type = np.uint8) -> np.ndarray:
     return cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB)
 
 
+def read_unchanged(path: str | Path) -> np.ndarray:
+    """Read one image with all its channels: (height, width), or blue, green, red and alpha last.
+
+    Its numbers are those of the file. Raises InputError if it is not a complete image.
+    """
+    return _decoded(path, cv2.IMREAD_UNCHANGED, np.float64)
+
+
 def read_ids(path: str | Path) -> np.ndarray:
     """Read one PNG of numbers such as class ids, shape (height, width), uint8 or uint16.
 
