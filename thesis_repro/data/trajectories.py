@@ -160,7 +160,9 @@ def read_poses_at(path: Path, times: np.ndarray) -> tuple[np.ndarray, np.ndarray
     from evo.tools import file_interface
 
     nowhere = np.zeros((len(times), 3)), np.tile([1.0, 0, 0, 0], (len(times), 1))
-    frames = PoseTrajectory3D(*nowhere, times, name=f"the times of the frames of {path.parent}")
+    frames = PoseTrajectory3D(
+        *nowhere, times.astype(float), name=f"the times of the frames of {path.parent}"
+    )
     lines = [" ".join(line.split()) for line in read_text(path).splitlines()]
     file = io.StringIO("\n".join(filter(None, lines)))
     read = file_interface.read_tum_trajectory_file
