@@ -24,7 +24,7 @@ from thesis_repro.data.cityscapes import (
 )
 from thesis_repro.data.frames import white_level
 from thesis_repro.data.ids import names
-from thesis_repro.data.trajectories import read_poses, write_tum
+from thesis_repro.data.trajectories import read_poses, read_poses_at, write_tum
 from thesis_repro.errors import InputError
 from thesis_repro.masks import folders
 
@@ -619,3 +619,11 @@ def test_names_and_numbers_that_cannot_be_are_one_line(own, options, said, monke
     (line,) = capsys.readouterr().err.splitlines()
     assert re.match(f"error: .*{said}", line)
     assert not (own.parent / "path.txt").exists()
+
+
+def test_times_of_frames_in_whole_seconds(tmp_path):
+    written = np.tile(np.eye(4), (3, 1, 1))
+    write_tum(tmp_path / "poses.txt", written, np.arange(3.0))
+    frames, poses = read_poses_at(tmp_path / "poses.txt", np.arange(1, 5))
+    assert list(frames) == [0, 1]  # at seconds 1 and 2
+    np.testing.assert_array_equal(poses, written[1:])
