@@ -23,7 +23,7 @@ PACKAGES = "thesis_repro", "keypoint_study", "street_world", "opencv_exact"
 # what thesis_repro.segmentation has set in this process
 SET_BY_TESTS = {"SM_FRAMEWORK", "NO_ALBUMENTATIONS_UPDATE", "TF_CPP_MIN_LOG_LEVEL", *ARITHMETIC}
 
-LINE_OF_TIMES = re.compile(rb"timed on|\(ms\)|frames a second")
+LINE_OF_TIMES = re.compile(rb"timed on|\(ms\)|frames a second|% of the time saved")
 
 
 class Result(NamedTuple):
