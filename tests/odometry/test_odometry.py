@@ -519,9 +519,12 @@ def assert_same(results, expected):
         pd.testing.assert_frame_equal(result.frames[columns], expected[name].frames[columns])
 
 
-def test_many_runs_in_one_pass_give_the_bits_of_separate_runs(drive):
+def test_many_runs_in_one_pass_give_the_bits_of_separate_runs(drive, monkeypatch):
     bad = Changed(drive, {4: BLACK}, frames=7)
+    strengths = counted(monkeypatch, sharing.cv2, "cornerMinEigenVal")
     together = odometry.run_many(bad, variants())
+    # once a frame, and once more for the check of swapped coordinates
+    assert len(strengths) <= len(bad) + 1
     assert_same(together, separately(bad, variants()))
     assert (together["kept"].frames["detected"].isna()).any()
     assert together["all"].frames["track_seconds"].isna().all()
@@ -554,6 +557,17 @@ def test_runs_of_one_tracking_share_masks_and_essential_matrices(drive, monkeypa
     assert_same(together, separately(few, runs))
     # the refined runs are equal for both orders here, the others differ
     assert len({result.poses.tobytes() for result in together.values()}) == 3
+
+
+def test_a_mask_that_fails_ends_its_own_runs_alone(drive):
+    few, wrong = Changed(drive, frames=4), [None, None, np.zeros((2, 2), np.uint8), None]
+    runs = {"all": (THESIS, None), "striped": (THESIS, Stripes(20)), "wrong": (THESIS, wrong)}
+    failed = {}
+    together = odometry.run_many(few, runs, failed=failed)
+    assert_same(together, separately(few, {name: runs[name] for name in ("all", "striped")}))
+    assert list(failed) == ["wrong"] and "frame 2" in failed["wrong"]
+    with pytest.raises(InputError, match="frame 2"):
+        odometry.run_many(few, runs)
 
 
 @dataclass(frozen=True)

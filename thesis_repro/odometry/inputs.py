@@ -155,5 +155,17 @@ def _may_be_swapped(points: np.ndarray, frame: np.ndarray) -> bool:
     if len(both) < MANY:
         return False
     columns, rows = np.rint(both).astype(int).T
-    strength = cv2.cornerMinEigenVal(frame, THESIS.block_size)
+    strength = _corner_strength(frame)
     return bool(strength[columns, rows].mean() > WEAKER * strength[rows, columns].mean())
+
+
+_latest: tuple[np.ndarray, np.ndarray] | None = None  # a frame and its strength
+
+
+def _corner_strength(frame: np.ndarray) -> np.ndarray:
+    """Corner strength of each pixel. That of the latest frame is kept, for all runs that share it."""
+    global _latest
+    latest = _latest  # another thread may change it
+    if latest is None or latest[0] is not frame:
+        latest = _latest = frame, cv2.cornerMinEigenVal(frame, THESIS.block_size)
+    return latest[1]

@@ -130,6 +130,7 @@ def run_many(
     sequence: SequenceLike,
     runs: Mapping[Any, tuple[OdometrySettings, Masks | None]],
     description: str | None = None,
+    failed: dict[Any, str] | None = None,
 ) -> dict[Any, Result]:
     """Make many runs, {name: (settings, masks)}, over one sequence. Returns {name: Result}.
 
@@ -137,6 +138,8 @@ def run_many(
     decoded, corner strengths computed, points tracked, and equal matches searched for an essential
     matrix. OpenCV's search and vote are replaced by faster ones with the same bits (opencv_exact).
     The times of the four calls are blank, because they cannot be measured for a single run.
+    failed: gets {name: reason} of runs that a mask or keypoints end, and the others go on. Without
+    it, the first such InputError is raised.
     """
     from thesis_repro.odometry.sharing import SharedCalls  # compiles functions on first use
 
@@ -147,21 +150,30 @@ def run_many(
         odometries[name] = Odometry(
             sequence.intrinsics, settings, start_pose(sequence), together.calls
         )
-    distinct = {id(masks): masks for _, masks in runs.values()}
     step_lengths = sequence.scales
-    rows: dict[str, list[list]] = {name: [] for name in runs}
+    rows: dict[Any, list[list]] = {name: [] for name in runs}
     for index in progress(range(len(sequence)), description):
         frame = sequence.frame(index)
         frame.setflags(write=False)  # so that all runs share it
         together.expect(frame, odometries.values())
         visible = sequence.visible(index)
-        made = {key: _mask_of_frame(masks, index, visible) for key, masks in distinct.items()}
-        for name, odometry in odometries.items():
-            mask, mask_seconds = made[id(runs[name][1])]
-            step = odometry.step(frame, step_lengths[index], mask)
+        made: dict[int, tuple] = {}  # of this frame, by the identity of its masks
+        for name, odometry in list(odometries.items()):
+            masks = runs[name][1]
+            try:
+                if id(masks) not in made:
+                    made[id(masks)] = _mask_of_frame(masks, index, visible)
+                mask, mask_seconds = made[id(masks)]
+                step = odometry.step(frame, step_lengths[index], mask)
+            except InputError as error:
+                if failed is None:
+                    raise
+                failed[name] = str(error)
+                del odometries[name]
+                continue
             step.seconds = dict.fromkeys(TIMED_PARTS, np.nan)
             rows[name].append([*step.row().values(), mask_seconds])
-    return {name: _result(rows[name], settings) for name, (settings, _) in runs.items()}
+    return {name: _result(rows[name], runs[name][0]) for name in odometries}
 
 
 def _mask_of_frame(
