@@ -1,17 +1,16 @@
-"""Controls: masks that know nothing of the frame's classes, and the distance of spread keypoints.
+"""Controls: masks that know nothing of the frame's classes, and how far spread keypoints are."""
 
-Masks are indexed by frame number, as in `masks`.
-"""
-
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from itertools import repeat
+from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 from scipy.spatial.distance import cdist
 
-from keypoint_study.sources import Source
+from keypoint_study.sources import FileMasks
 from thesis_repro.data.cityscapes import ID
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.masks import dilate
@@ -23,134 +22,134 @@ COVERAGE_TOLERANCE = 0.002  # of the frame
 SAMPLE = 12  # frames on which the distance between keypoints is chosen
 STEP = 0.1  # pixels between the distances that are tried
 NEIGHBOURHOOD = 40  # pixels
-LINE_WIDTH = 10  # pixels, of lines and edges as controls of ready-made masks, which have no width
 
 
-class OtherFrame:
-    """The mask of the frame half a sequence away: similar boundaries in the wrong place."""
+@dataclass(frozen=True, eq=False)
+class MadeMasks:
+    """Masks that a function makes: masks[i] = make(given, *values, i) for frame i.
 
-    def __init__(self, source: Source, sequence: Sequence, dilation_width: int | None) -> None:
-        self.sequence = sequence
-        self.masks = source.masks(sequence, dilation_width)
-        self.paths = self.masks.paths
-        self.line_width = dilation_width or LINE_WIDTH
+    given: other masks, or a sequence. values: what else the function takes.
+    """
+
+    make: Callable
+    given: Any
+    values: tuple = ()
 
     def __len__(self) -> int:
-        return len(self.masks)
+        return len(self.given)
+
+    def __getitem__(self, index: int) -> np.ndarray:
+        return self.make(self.given, *self.values, index)
+
+    @property
+    def paths(self) -> list[Path]:
+        """The files that the masks are made from, beside the frames."""
+        return getattr(self.given, "paths", [])
 
     def record(self) -> list[Any]:
         """Return what the masks depend on beside files."""
-        return [type(self).__name__, *self.masks.record()]
-
-    def check_files(self, known: set[Any]) -> None:
-        """Raise InputError if a file of the source is damaged, see `LabelMasks.check_files`."""
-        self.masks.check_files(known)
-
-    def __getitem__(self, index: int) -> np.ndarray:
-        count = len(self)
-        return self.masks[(index + count // 2) % count]
+        parts = [part for part in (self.given, *self.values) if not hasattr(part, "frame")]
+        return [self.make.__name__, *(recorded(part) for part in parts)]
 
 
-class Mirrored(OtherFrame):
+def recorded(part: Any) -> Any:
+    """Return what a record of results says of masks, or of a value that they are made from.
+
+    An object without `record()` is described in Python's words: what those leave out, such as its
+    address, is never the same again, so its runs are made again.
+    """
+    return part.record() if hasattr(part, "record") else repr(part)
+
+
+# Functions of masks, of more values and of the number of a frame
+
+
+def other_frame(masks: FileMasks, index: int) -> np.ndarray:
+    """The mask of the frame half a sequence away: similar boundaries in the wrong place."""
+    return masks[(index + len(masks) // 2) % len(masks)]
+
+
+def mirrored(masks: FileMasks, index: int) -> np.ndarray:
     """The mask of the frame, flipped left to right.
 
     It looks like a street, but not like the street in the frame.
     """
-
-    def __getitem__(self, index: int) -> np.ndarray:
-        return cv2.flip(self.masks[index], 1)
+    return cv2.flip(masks[index], 1)
 
 
-class RandomLines(OtherFrame):
+def random_lines(masks: FileMasks, line_width: int, index: int) -> np.ndarray:
     """Random line segments that cover as many pixels as the mask of the frame.
 
     They are dilated like the boundaries.
     """
-
-    def __getitem__(self, index: int) -> np.ndarray:
-        mask = self.masks[index]
-        target = np.count_nonzero(mask)
-        for number in (2**8, 2**11, 2**14):
-            first = self._first_segments(index, number, mask.shape)
-            pixels = cv2.calcHist([first], [0], None, [number], [0, number])
-            covered = np.cumsum(pixels, dtype=int)  # by the first 1, 2, ... segments
-            if covered[-1] >= target:
-                break
-        count = np.abs(np.concatenate([[0], covered]) - target).argmin()
-        return cv2.compare(first, int(count), cv2.CMP_LT)
-
-    def _first_segments(self, index: int, number: int, shape: tuple[int, ...]) -> np.ndarray:
-        """Return, for each pixel, the index of the first dilated segment that covers it.
-
-        The index is `number` if none does.
-        """
-        random = np.random.default_rng((0, index))
-        height, width = shape
-        start_x, start_y, angle, length = random.uniform(size=(number, 4)).T
-        length = length * height / 2
-        start = np.column_stack([start_x * width, start_y * height])
-        direction = np.column_stack([np.cos(2 * np.pi * angle), np.sin(2 * np.pi * angle)])
-        end = start + direction * length[:, None]
-        image = np.full(shape, number, np.uint16)
-        starts, ends = start.astype(int).tolist(), end.astype(int).tolist()
-        for segment in reversed(range(number)):  # so that the first one is on top
-            cv2.line(image, starts[segment], ends[segment], segment)
-        # the lowest index near a pixel
-        square = np.ones((self.line_width, self.line_width), np.uint8)
-        return cv2.erode(image, square)
+    mask = masks[index]
+    target = np.count_nonzero(mask)
+    for number in (2**8, 2**11, 2**14):
+        first = _first_segments(index, number, mask.shape, line_width)
+        pixels = cv2.calcHist([first], [0], None, [number], [0, number])
+        covered = np.cumsum(pixels, dtype=int)  # by the first 1, 2, ... segments
+        if covered[-1] >= target:
+            break
+    count = np.abs(np.concatenate([[0], covered]) - target).argmin()
+    return cv2.compare(first, int(count), cv2.CMP_LT)
 
 
-class ImageEdges(OtherFrame):
+def _first_segments(index: int, number: int, shape: tuple[int, ...], line_width: int) -> np.ndarray:
+    """Return, for each pixel, the index of the first dilated segment that covers it.
+
+    The index is `number` if none does.
+    """
+    random = np.random.default_rng((0, index))
+    height, width = shape
+    start_x, start_y, angle, length = random.uniform(size=(number, 4)).T
+    length = length * height / 2
+    start = np.column_stack([start_x * width, start_y * height])
+    direction = np.column_stack([np.cos(2 * np.pi * angle), np.sin(2 * np.pi * angle)])
+    end = start + direction * length[:, None]
+    image = np.full(shape, number, np.uint16)
+    starts, ends = start.astype(int).tolist(), end.astype(int).tolist()
+    for segment in reversed(range(number)):  # so that the first one is on top
+        cv2.line(image, starts[segment], ends[segment], segment)
+    # the lowest index near a pixel
+    square = np.ones((line_width, line_width), np.uint8)
+    return cv2.erode(image, square)
+
+
+def image_edges(masks: FileMasks, sequence: Sequence, line_width: int, index: int) -> np.ndarray:
     """The strongest Canny edges of the frame, dilated, that cover as many pixels as its mask.
 
     They need no network.
     """
-
-    def __getitem__(self, index: int) -> np.ndarray:
-        frame = self.sequence.frame(index)
-        target = np.count_nonzero(self.masks[index])
-        across, down = cv2.spatialGradient(frame)
-        low, high = 1, LARGEST_GRADIENT  # thresholds that cover too many and too few pixels
-        covered_low, covered_high = frame.size, 0
-        best, miss = np.zeros_like(frame), target
-        while high - low > 1 and miss > COVERAGE_TOLERANCE * frame.size:
-            # interpolation, kept away from both ends so that the interval always shrinks
-            share = np.clip((covered_low - target) / (covered_low - covered_high), 0.1, 0.9)
-            between = low * (high / low) ** share
-            threshold = int(np.clip(between, low + 1, high - 1))
-            mask = dilate(cv2.Canny(across, down, threshold / 2, threshold), self.line_width)
-            covered = cv2.countNonZero(mask)
-            if abs(covered - target) < miss:
-                best, miss = mask, abs(covered - target)
-            if covered > target:
-                low, covered_low = threshold, covered
-            else:
-                high, covered_high = threshold, covered
-        return best
+    frame = sequence.frame(index)
+    target = np.count_nonzero(masks[index])
+    across, down = cv2.spatialGradient(frame)
+    low, high = 1, LARGEST_GRADIENT  # thresholds that cover too many and too few pixels
+    covered_low, covered_high = frame.size, 0
+    best, miss = np.zeros_like(frame), target
+    while high - low > 1 and miss > COVERAGE_TOLERANCE * frame.size:
+        # interpolation, kept away from both ends so that the interval always shrinks
+        share = np.clip((covered_low - target) / (covered_low - covered_high), 0.1, 0.9)
+        between = low * (high / low) ** share
+        threshold = int(np.clip(between, low + 1, high - 1))
+        mask = dilate(cv2.Canny(across, down, threshold / 2, threshold), line_width)
+        covered = cv2.countNonZero(mask)
+        if abs(covered - target) < miss:
+            best, miss = mask, abs(covered - target)
+        if covered > target:
+            low, covered_low = threshold, covered
+        else:
+            high, covered_high = threshold, covered
+    return best
 
 
-class WithoutClasses(OtherFrame):
+def without_classes(masks: LabelMasks, classes: tuple[str, ...], index: int) -> np.ndarray:
     """The whole frame but some classes. The label map is enlarged by nearest neighbour."""
+    left_out = np.isin(masks.label_map(index), [ID[name] for name in classes])
+    allowed = np.where(left_out, np.uint8(0), np.uint8(255))
+    return cv2.resize(allowed, masks.size[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
 
-    def __init__(
-        self,
-        source: Source,
-        sequence: Sequence,
-        dilation_width: int | None,
-        classes: tuple[str, ...],
-    ) -> None:
-        super().__init__(source, sequence, dilation_width)
-        self.classes = classes
 
-    def record(self) -> list[Any]:
-        """Return what the masks depend on beside files."""
-        return [*super().record(), *self.classes]
-
-    def __getitem__(self, index: int) -> np.ndarray:
-        assert isinstance(self.masks, LabelMasks)  # only those have classes
-        left_out = np.isin(self.masks.label_map(index), [ID[name] for name in self.classes])
-        allowed = np.where(left_out, np.uint8(0), np.uint8(255))
-        return cv2.resize(allowed, self.masks.size[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
+# Detectors, and their settings
 
 
 def beside(

@@ -1,4 +1,4 @@
-"""The odometry runs of a study, as a list of jobs.
+"""The runs of a study, as a list of jobs: of paths, and of the worth of a keypoint.
 
 Chapter 4 runs every sequence with all keypoints, with masks of each width and with a reduced number
 of keypoints. The controls test whether it is the segmentation that helps. Those without a mask need
@@ -13,15 +13,28 @@ from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from keypoint_study.methods import LABEL_MAPS, MASK_CONTROLS, METHODS, changed
+from keypoint_study.controls import recorded
+from keypoint_study.methods import (
+    ALTERED,
+    BROUGHT,
+    CONTROL_WIDTH,
+    DECIDING,
+    LABEL_MAPS,
+    MASK_CONTROLS,
+    METHODS,
+    REFERENCE,
+    STUDY,
+    WORTH,
+    Asked,
+    changed,
+    of_group,
+    with_numbers,
+)
 from keypoint_study.sources import UNMASKED, Source
 from thesis_repro.data.kitti import TRUE_LABELS, Sequence
 from thesis_repro.errors import InputError
-from thesis_repro.odometry import OdometrySettings, estimators
+from thesis_repro.odometry import THESIS, OdometrySettings, estimators
 
-# Pixels: the dilation width of Section 3.6 and Figures 3.6 and 4.5, at which masks are tested. It
-# was fixed before any run. (The code of appendix A.8 dilates by 5, audit row 26.)
-CONTROL_WIDTH = 10
 # {name: title}
 ESTIMATORS = {name: estimator.title for name, estimator in estimators.ESTIMATORS.items()}
 
@@ -31,10 +44,11 @@ class Job:
     """One run of the odometry over one sequence. The defaults are the thesis's settings.
 
     method: one of METHODS.
-    dilation_width: pixels, for masks from label maps; for "fewer" and "spread", the width of the
-    masks that leave as many keypoints. source: name of the source of the masks, or of the masks
-    that gave the number of keypoints; empty if there is only one source. max_keypoints,
-    min_distance (pixels): limits of the detector.
+    dilation_width: pixels, for masks from label maps, None for CONTROL_WIDTH; for "fewer" and
+    "spread", the width of the masks that leave as many keypoints. source: name of the source of the
+    masks, or of the masks that gave the number of keypoints; empty if there is only one source.
+    max_keypoints: how many the method is asked for, 0 for no limit. min_distance: pixels, of the
+    detector.
     estimator: one of estimators.ESTIMATORS.
     repetition: 0 is the thesis's single run; any other number is the seed that shuffles the matched
     points.
@@ -72,7 +86,6 @@ class Job:
         """Return the settings of the odometry that the job asks for."""
         asked: dict[str, Any] = {
             "estimator": estimators.ESTIMATORS[self.estimator].make,
-            "max_keypoints": self.max_keypoints,
             "min_distance": self.min_distance,
             "shuffle_seed": self.repetition or None,
         }
@@ -80,11 +93,12 @@ class Job:
 
 
 class Run(NamedTuple):
-    """A run of the odometry. masks: see `runner.run_all`."""
+    """A run. masks: `odometry.Masks`. brought: in place of the odometry or of parts of it."""
 
     sequence: Sequence
     settings: OdometrySettings
-    masks: Any
+    masks: Any = None
+    brought: Source | None = None
 
 
 def runs_of(
@@ -96,33 +110,41 @@ def runs_of(
 ) -> dict[Job, Run | str]:
     """Return the runs of jobs, or the reason why one cannot run, as `runner.run_all` takes them.
 
-    sources: of the jobs. settings: changes of all runs; masked_settings: of those with masks. Jobs
-    with the same masks get the same object, by which `odometry.run_many` recognises that they share
-    work.
+    sources: of the jobs. settings: changes of all runs; masked_settings: of those with masks. Masks
+    with equal records are one object, by which `odometry.run_many` recognises that runs share work.
     """
     sources_by_name = {source.name: source for source in sources}
     default = next(iter(sources_by_name.values()))
     opened = {sequence.name: sequence for sequence in sequences}
 
+    known: dict[Any, Any] = {}  # masks
+
     @cache
-    def choice(method: str, sequence: str, source: str, width: int | None) -> Any:
+    def choice(
+        method: str, sequence: str, source: str, width: int | None, number: int | None
+    ) -> Run | str:
+        given, frames = sources_by_name.get(source, default), opened[sequence]
+        if method in UNMASKED:
+            brought = replace(given, folder=given.file(sequence))
+            return Run(frames, THESIS, brought=brought)
+        asked = Asked(frames, given, CONTROL_WIDTH if width is None else width, number)
         try:
-            given = sources_by_name.get(source, default)
-            return METHODS[method].choose(opened[sequence], given, width)
+            own, masks = METHODS[method].choose(asked)
         except InputError as error:
             return str(error)
+        if masks is not None:
+            key = sequence, str(recorded(masks)), tuple(getattr(masks, "paths", ()))
+            masks = known.setdefault(key, masks)
+        return Run(frames, own, masks)
 
     runs: dict[Job, Run | str] = {}
     for job in jobs:
-        chosen = choice(job.method, job.sequence, job.source, job.dilation_width)
-        if isinstance(chosen, str):
-            runs[job] = chosen
-            continue
-        own, masks = chosen
-        changes = {**settings, **job.changes()}
-        if masks is not None and job.method not in UNMASKED:
-            changes |= masked_settings
-        runs[job] = Run(opened[job.sequence], changed(own, changes), masks)
+        run = choice(job.method, job.sequence, job.source, job.dilation_width, job.max_keypoints)
+        if not isinstance(run, str):
+            of_masks = masked_settings if run.masks is not None else {}
+            changes = {**settings, **job.changes(), **of_masks}
+            run = run._replace(settings=changed(run.settings, changes))
+        runs[job] = run
     return runs
 
 
@@ -181,11 +203,46 @@ def mask_controls(
     for name in MASK_CONTROLS:
         method = METHODS[name]
         is_of_labels = method.group == LABEL_MAPS
-        if (method.every_study or name in named) and (source.has_label_maps or not is_of_labels):
+        if (STUDY in method.where or name in named) and (source.has_label_maps or not is_of_labels):
             allowed[name] = width if source.has_width or is_of_labels else None
     if not (sequence.folder / TRUE_LABELS).is_dir():
         allowed.pop("true-labels", None)
     return allowed
+
+
+def worth_jobs(
+    sequences: Iterable[Sequence],
+    sources: Iterable[Source],
+    width: int | None,
+    numbers: Iterable[int] = (DECIDING,),
+    with_controls: bool = True,
+    named: Collection[str] = (),
+) -> list[Job]:
+    """Return the jobs of a study for `worth_runs.WORTH`, of one sequence after the other.
+
+    numbers: of keypoints that are drawn, see `methods.with_numbers`. with_controls: also altered
+    masks, and the controls of `mask_controls`; named: see there.
+    """
+    pairs = with_numbers(WORTH, numbers)
+    jobs: list[Job] = []
+    for sequence in sequences:
+        widths: list[tuple[str, dict[str, int | None]]] = [("", dict.fromkeys(of_group(REFERENCE)))]
+        for source in sources:
+            own = width if source.has_width else None
+            of_source: dict[str, int | None] = dict.fromkeys(of_group(BROUGHT), own)
+            if source.kind in UNMASKED:
+                of_source = {source.kind: None}
+            elif with_controls:
+                of_source |= dict.fromkeys(of_group(ALTERED), own)
+                of_source |= mask_controls(source, sequence, width, named)
+            widths.append((source.name, of_source))
+        jobs += [
+            Job(sequence.name, name, of_source[name], number, source=source)
+            for source, of_source in widths
+            for name, number in pairs
+            if name in of_source
+        ]
+    return jobs
 
 
 def repeated(jobs: Iterable[Job], estimators: Iterable[str], repetitions: int) -> list[Job]:

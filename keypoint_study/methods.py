@@ -1,140 +1,257 @@
-"""What a study compares: one table of methods.
+"""What is compared: one table of ways to choose keypoints, METHODS.
 
-A method chooses the keypoints of a run. Beside all keypoints and masks, there are *controls*: masks
-and settings that leave as many keypoints as the masks of the segmentation, chosen differently. If
-the odometry gains as much from a control, the segmentation is not what helps. A new method is a
-function and an entry in METHODS, a new error of a path one in path_errors.py.
+Studies, tables of few keypoints, ablations and the worth select from it. Beside all keypoints and
+masks, there are *controls*: masks and settings that leave as many keypoints as the masks of the
+segmentation, chosen differently. If the odometry gains as much from a control, the segmentation is
+not what helps. A new method is a function and an entry in METHODS.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import replace
+from functools import lru_cache
 from typing import Any, NamedTuple, TypeAlias
 
-from keypoint_study.controls import (
-    ImageEdges,
-    Mirrored,
-    OtherFrame,
-    RandomLines,
-    WithoutClasses,
-    beside,
-)
+import numpy as np
+
+from keypoint_study import ablations, controls
+from keypoint_study.controls import MadeMasks
 from keypoint_study.sources import Source
 from thesis_repro.data.cityscapes import LABELS
 from thesis_repro.data.kitti import TRUE_LABELS, Sequence
 from thesis_repro.masks import MOVABLE, MaskSettings
 from thesis_repro.odometry import THESIS, OdometrySettings
-from thesis_repro.odometry.keypoints import filtered, spread
+from thesis_repro.odometry.keypoints import filled, filtered, orb, spread
+from thesis_repro.odometry.loop import detect
 
+# Pixels: the dilation width of Section 3.6 and Figures 3.6 and 4.5, at which masks are tested, and
+# the width of lines and edges as controls. It was fixed before any run. (The code of appendix A.8
+# dilates by 5, audit row 26.)
+CONTROL_WIDTH = 10
+FEW_SPREAD = 200  # keypoints spread on or off the masks
+FILL = 5  # keypoints in each of 16 x 5 fields of the frame, for masks that are filled
 # All corrections together. No error was used to choose them: a label map of 320 columns places a
 # boundary within about 2 pixels of the frame, and within 10 pixels of its border the Lucas-Kanade
 # window of 21 pixels is cut off.
-FEW = 200  # keypoints spread on or off the masks
 CORRECTED = MaskSettings("exact", symmetric=True, movable=2, margin=10)
 
 
-# The methods: functions of a sequence, a source and a width of its masks in pixels
+# The methods: functions of what is asked
 
 Choice: TypeAlias = tuple[OdometrySettings, Any]  # settings and masks of a run, or None
 
 
-def all_keypoints(sequence: Sequence, source: Source, width: int | None) -> Choice:
+class Asked(NamedTuple):
+    """What a method chooses for.
+
+    width: pixels, of masks that have one, and of lines. number: of keypoints, 0 for no limit; None
+    if nobody says.
+    """
+
+    sequence: Sequence
+    source: Source
+    width: int = CONTROL_WIDTH
+    number: int | None = None
+
+
+def all_keypoints(asked: Asked) -> Choice:
     """Run as the thesis does, without masks."""
     return THESIS, None
 
 
-def masked(sequence: Sequence, source: Source, width: int | None) -> Choice:
+def masked(asked: Asked) -> Choice:
     """Run with the masks of the source."""
-    return THESIS, source.masks(sequence, width)
+    return THESIS, asked.source.masks(asked.sequence, asked.width)
 
 
-def brought(sequence: Sequence, source: Source, width: int | None) -> Choice:
-    """Run with what the source brings in place of the odometry or parts of it."""
-    return THESIS, replace(source, folder=source.file(sequence.name))
+def strongest(choose: Callable[[Asked], Choice]) -> Callable[[Asked], Choice]:
+    """Return a method with the strongest keypoints of another one alone.
+
+    There are as many as masks leave, if nobody says how many.
+    """
+
+    def limited(asked: Asked) -> Choice:
+        settings, masks = choose(asked)
+        number = number_left(asked) if asked.number is None else asked.number
+        return (replace(settings, max_keypoints=number) if number else settings), masks
+
+    return limited
 
 
-def altered(masks: type[OtherFrame]) -> Callable[..., Choice]:
-    """Return a method with masks that are made from those of the source."""
-    return lambda sequence, source, width: (THESIS, masks(source, sequence, width))
+def at_most(number: int) -> Callable[[Asked], Choice]:
+    """Return a method with a number of the strongest keypoints."""
+    return lambda asked: (replace(THESIS, max_keypoints=number), None)
 
 
-def with_masks(settings: MaskSettings | None = None, **changes: Any) -> Callable[..., Choice]:
+def drawn(asked: Asked) -> Choice:
+    """Run with as many random keypoints as are asked for, or as masks leave."""
+    number = number_left(asked) if asked.number is None else asked.number
+    return THESIS, MadeMasks(ablations.random_keypoints, asked.sequence, (number,))
+
+
+@lru_cache(maxsize=2)
+def number_left(asked: Asked) -> int:
+    """Return how many keypoints the masks of the source leave, from some frames."""
+    sequence, (_, masks) = asked.sequence, masked(asked)
+    some_frames = range(0, len(sequence), max(1, len(sequence) // 8))
+    numbers = [len(detect(sequence.frame(index), THESIS, masks[index])) for index in some_frames]
+    return max(1, round(np.mean(numbers)))  # OpenCV takes 0 as "no limit"
+
+
+def spread_out(asked: Asked) -> Choice:
+    """Run with keypoints that are spread over the frame."""
+    return replace(THESIS, detector=spread(asked.number or FEW_SPREAD)), None
+
+
+def altered(make: Callable, *values: Any) -> Callable[[Asked], Choice]:
+    """Return a method with masks that a function makes from those of the source."""
+    return lambda asked: (THESIS, MadeMasks(make, masked(asked)[1], values))
+
+
+def with_lines(make: Callable) -> Callable[[Asked], Choice]:
+    """Return a method with lines of the masks' width, that a function makes from the masks."""
+    return lambda asked: altered(make, asked.width)(asked)
+
+
+def image_edges(asked: Asked) -> Choice:
+    """Run with the edges of the frame."""
+    return altered(controls.image_edges, asked.sequence, asked.width)(asked)
+
+
+def of_sequence(make: Callable, *values: Any) -> Callable[[Asked], Choice]:
+    """Return a method with masks that a function makes from the sequence."""
+    return lambda asked: (THESIS, MadeMasks(make, asked.sequence, values))
+
+
+def with_masks(settings: MaskSettings | None = None, **changes: Any) -> Callable[[Asked], Choice]:
     """Return a method with other masks from the same label maps.
 
     settings: of the masks; None: those of the source, with changes.
     """
 
-    def choose(sequence: Sequence, source: Source, width: int | None) -> Choice:
-        ids = source.settings.ids
-        chosen = replace(settings or source.settings, **{"ids": ids, **changes})
-        return masked(sequence, replace(source, settings=chosen), width)
+    def choose(asked: Asked) -> Choice:
+        own = asked.source.settings
+        chosen = replace(settings or own, **{"ids": own.ids, **changes})
+        return masked(asked._replace(source=replace(asked.source, settings=chosen)))
 
     return choose
 
 
-def from_true_labels(sequence: Sequence, source: Source, width: int | None) -> Choice:
+def from_true_labels(asked: Asked) -> Choice:
     """Run with masks from the true label maps."""
-    settings = replace(source.settings, ids="labels")
-    true = replace(source, folder=sequence.folder / TRUE_LABELS, settings=settings)
-    return masked(sequence, true, width)
+    settings = replace(asked.source.settings, ids="labels")
+    folder = asked.sequence.folder / TRUE_LABELS
+    return masked(asked._replace(source=replace(asked.source, folder=folder, settings=settings)))
 
 
-def changed(own: OdometrySettings, changes: Mapping[str, Any]) -> OdometrySettings:
-    """Return a method's settings with the changes of a study, but for those that it sets itself."""
-    free = {name for name, value in vars(own).items() if value == getattr(THESIS, name)}
-    return replace(own, **{name: value for name, value in changes.items() if name in free})
-
-
-def found_by(detector: Callable, choose: Callable[..., Choice]) -> Callable[..., Choice]:
+def found_by(detector: Callable, choose: Callable[[Asked], Choice]) -> Callable[[Asked], Choice]:
     """Return a method with the masks of another one, and a detector of its own."""
 
-    def changed_choice(sequence: Sequence, source: Source, width: int | None) -> Choice:
-        settings, masks = choose(sequence, source, width)
+    def changed_choice(asked: Asked) -> Choice:
+        settings, masks = choose(asked)
         return replace(settings, detector=detector), masks
 
     return changed_choice
 
 
-def without(*classes: str) -> Callable[..., Choice]:
-    """Return a method with the thesis's keypoints, but those on some classes."""
+def changed(own: OdometrySettings, changes: Mapping[str, Any]) -> OdometrySettings:
+    """Return a method's settings with the changes of a study, but for those that it sets itself.
 
-    def choose(sequence: Sequence, source: Source, width: int | None) -> Choice:
-        masks = WithoutClasses(source, sequence, width, classes)
-        return replace(THESIS, detector=filtered), masks
+    A method that fills masks fills what the study's detector finds.
+    """
+    free = {name for name, value in vars(own).items() if value == getattr(THESIS, name)}
+    if isinstance(own.detector, filled) and own.detector.detector is None:
+        own = replace(own, detector=replace(own.detector, detector=changes.get("detector")))
+    return replace(own, **{name: value for name, value in changes.items() if name in free})
 
-    return choose
+
+# Where a method is compared, and with how many keypoints
+
+# studies with controls; those that name it (--controls NAME); chapter 4, the ablations and few
+# keypoints, of the notebooks; the worth of a keypoint
+STUDY, NAMED, CHAPTER_4, ABLATIONS, FEW, WORTH = (
+    "study",
+    "named",
+    "chapter 4",
+    "ablations",
+    "few",
+    "worth",
+)
+# all that it leaves; each number of a list; the number that decides on the worth; as many as masks
+# leave
+ALL, EACH, DECIDING, AS_MANY = 0, "each", 400, "as many"
+IN_STUDY: Mapping[str, Collection] = {STUDY: {ALL}, WORTH: {DECIDING}}
+IF_NAMED: Mapping[str, Collection] = {NAMED: {ALL}, WORTH: {DECIDING}}
+ABLATION: Mapping[str, Collection] = {ABLATIONS: {ALL}}
 
 
 class Method(NamedTuple):
     """A way to choose the keypoints of a run.
 
-    title: in tables and figures. group: REFERENCE, BROUGHT by the user, from LABEL_MAPS of the
-    user, a CONTROL without segmentation, which keeps as many pixels or keypoints as the masks do
-    but knows nothing of the classes, or THESIS_ONLY, for a figure of the thesis. choose: from a
-    sequence, a source and a width to the settings and masks of a run. Its own settings win over
-    those of a study.
-    every_study: whether every study with controls runs it; else those that name it (--controls
-    NAME). as_many: whether the job says how many keypoints it keeps, as many as the masks.
+    title: in tables and figures. group: REFERENCE, without masks; with the masks BROUGHT by a user,
+    or these ALTERED; OWN keypoints or paths of a user; from LABEL_MAPS of the user; a CONTROL
+    without segmentation, which keeps as many pixels or keypoints as the masks do but knows nothing
+    of the classes; or THESIS_ONLY, for the thesis's figures and the audit. choose: from what is
+    asked to the settings and masks of a run. Its own settings win over those of a study. where: in
+    what it is compared, with how many keypoints.
     """
 
     title: str
     group: str
-    choose: Callable[[Sequence, Source, int | None], Choice]
-    every_study: bool = True
-    as_many: bool = False
+    choose: Callable[[Asked], Choice]
+    where: Mapping[str, Collection] = IN_STUDY
 
 
-REFERENCE, BROUGHT, LABEL_MAPS, CONTROL, THESIS_ONLY = (
+REFERENCE, BROUGHT, OWN, ALTERED, LABEL_MAPS, CONTROL, THESIS_ONLY = (
     "reference",
     "brought",
+    "own",
+    "altered",
     "label maps",
     "control",
     "thesis",
 )
+
+
+def ablation(choose: Callable[[Asked], Choice]) -> Method:
+    """Return a method that differs from the thesis in one thing, for the audit."""
+    return Method("", THESIS_ONLY, choose, ABLATION)
+
+
 METHODS = {  # in the order in which they are shown
-    "baseline": Method("all keypoints", REFERENCE, all_keypoints),
-    "masked": Method("masks", BROUGHT, masked),
-    "keypoints": Method("own keypoints", BROUGHT, brought),  # these two as sources.KINDS has them
-    "paths": Method("path of another system", BROUGHT, brought),
+    "baseline": Method(
+        "all keypoints",
+        REFERENCE,
+        all_keypoints,
+        {STUDY: {ALL}, ABLATIONS: {ALL}, FEW: {ALL}},
+    ),
+    "masked": Method(
+        "masks", BROUGHT, masked, {STUDY: {ALL}, ABLATIONS: {ALL}, WORTH: {ALL, EACH}}
+    ),
+    # these two as sources.KINDS has them
+    "keypoints": Method("own keypoints", OWN, all_keypoints, {STUDY: {ALL}, WORTH: {ALL, EACH}}),
+    "paths": Method("path of another system", OWN, all_keypoints, {STUDY: {ALL}}),
+    "filter": ablation(found_by(filtered, masked)),
+    "nearest": ablation(altered(ablations.nearest, CONTROL_WIDTH)),
+    "symmetric": ablation(with_masks(symmetric=True)),
+    "no-vegetation": ablation(altered(ablations.without_vegetation)),
+    # the worth draws so many of them
+    "drawn": Method("random keypoints", REFERENCE, all_keypoints, {WORTH: {ALL, EACH}}),
+    "strongest": Method(
+        "strongest keypoints",
+        REFERENCE,
+        strongest(all_keypoints),
+        {FEW: {EACH}, WORTH: {DECIDING}, ABLATIONS: {AS_MANY}},
+    ),
+    "random": Method("random ones", REFERENCE, drawn, {FEW: {EACH}, ABLATIONS: {AS_MANY}}),
+    "spread-anywhere": Method(
+        "spread keypoints", REFERENCE, spread_out, {FEW: {EACH}, WORTH: {EACH}}
+    ),
+    "strongest-on": Method(
+        "strongest on the masks", BROUGHT, strongest(masked), {FEW: {ALL, EACH}, WORTH: {DECIDING}}
+    ),
+    "filled": Method(
+        "masks, filled", ALTERED, found_by(filled(FILL), masked), {FEW: {ALL}, WORTH: {DECIDING}}
+    ),
     "exact-boundaries": Method(
         "exact class boundaries", LABEL_MAPS, with_masks(boundaries="exact", keep="boundaries")
     ),
@@ -145,24 +262,33 @@ METHODS = {  # in the order in which they are shown
     "static": Method("all but movable things", LABEL_MAPS, with_masks(keep="static")),
     "inverse": Method("all but the boundaries", LABEL_MAPS, with_masks(keep="inverse")),
     "true-labels": Method("true label maps", LABEL_MAPS, from_true_labels),
-    "other-frame": Method("mask of another frame", CONTROL, altered(OtherFrame)),
-    "mirrored": Method("mirrored mask", CONTROL, altered(Mirrored)),
-    "random-lines": Method("random lines", CONTROL, altered(RandomLines)),
-    "image-edges": Method("edges of the image", CONTROL, altered(ImageEdges)),
-    "fewer": Method("fewer keypoints", CONTROL, all_keypoints, as_many=True),
-    "spread": Method("keypoints spread out", CONTROL, all_keypoints, as_many=True),
-    "reduced": Method("reduced keypoints", THESIS_ONLY, all_keypoints),  # Figure 4.12
+    "other-frame": Method("mask of another frame", CONTROL, altered(controls.other_frame)),
+    "mirrored": Method("mirrored mask", CONTROL, altered(controls.mirrored)),
+    "random-lines": Method("random lines", CONTROL, with_lines(controls.random_lines)),
+    "image-edges": Method("edges of the image", CONTROL, image_edges),
+    # their jobs say how many keypoints, or how far apart (`runner.keypoint_controls`)
+    "fewer": Method("fewer keypoints", CONTROL, strongest(all_keypoints), {STUDY: {AS_MANY}}),
+    "spread": Method("keypoints spread out", CONTROL, all_keypoints, {STUDY: {AS_MANY}}),
+    "reduced": Method(  # Figure 4.12
+        "reduced keypoints", THESIS_ONLY, strongest(all_keypoints), {CHAPTER_4: {AS_MANY}}
+    ),
 }
 # Whether it is what lies under the masks, or where in the frame they are: keypoints beside the
 # masks, and few that are spread over the frame, on the masks or off them.
 IN_PLACE = {
     f"beside-{name}": Method(
-        f"beside the {METHODS[name].title}", LABEL_MAPS, found_by(beside, METHODS[name].choose)
+        f"beside the {METHODS[name].title}",
+        LABEL_MAPS,
+        found_by(controls.beside, METHODS[name].choose),
+        IF_NAMED,
     )
     for name in ("masked", "exact-boundaries", "mirrored")
 } | {
     f"spread-{where}": Method(
-        f"{FEW} spread {words} the masks", LABEL_MAPS, found_by(spread(FEW), METHODS[name].choose)
+        f"{FEW_SPREAD} spread {words} the masks",
+        LABEL_MAPS,
+        found_by(spread(FEW_SPREAD), METHODS[name].choose),
+        IF_NAMED,
     )
     for where, words, name in (("on", "over", "masked"), ("off", "off", "inverse"))
 }
@@ -176,14 +302,59 @@ LEFT_OUT = {
     "vehicles and people": tuple(LABELS[number].name for number in MOVABLE),
 }
 EXPLORED = IN_PLACE | {
-    f"without-{name.replace(' ', '-')}": Method(f"without {name}", LABEL_MAPS, without(*classes))
+    f"without-{name.replace(' ', '-')}": Method(
+        f"without {name}",
+        LABEL_MAPS,
+        found_by(filtered, altered(controls.without_classes, classes)),
+        IF_NAMED,
+    )
     for name, classes in LEFT_OUT.items()
 }
-METHODS |= {name: method._replace(every_study=False) for name, method in EXPLORED.items()}
-AS_SLAM_SYSTEMS = ("static", "inverse", "static-boundaries")
+# pixels that are kept; the first two leave out distant points, the last near ones
+PARALLAX = {"parallax-1": (1, np.inf), "parallax-3": (3, np.inf), "parallax-20": (0, 20)}
+METHODS |= {
+    **EXPLORED,
+    "dropout": ablation(of_sequence(ablations.random_keypoints, 0.9)),
+    # a twentieth, a tenth and a fifth of the thesis's 2000
+    **{f"strongest-{few}": ablation(at_most(few)) for few in (100, 200, 400)},
+    **{
+        prefix + name: ablation(of_sequence(make, *span))
+        for name, span in PARALLAX.items()
+        for prefix, make in (("", ablations.with_parallax), ("as many as ", ablations.as_many))
+    },
+    "turned-into": ablation(of_sequence(ablations.half_in_turns, True)),
+    "turned-from": ablation(of_sequence(ablations.half_in_turns, False)),
+    "orb": ablation(found_by(orb, all_keypoints)),
+}
 # the methods with masks beside "masked", which the tested width of a study is for
 MASK_CONTROLS = [
     name
     for name, method in METHODS.items()
-    if method.group in (CONTROL, LABEL_MAPS) and not method.as_many
+    if method.group in (CONTROL, LABEL_MAPS) and AS_MANY not in method.where.get(STUDY, ())
 ]
+AS_SLAM_SYSTEMS = ("static", "inverse", "static-boundaries")
+
+
+def compared_in(place: str) -> list[str]:
+    """Return the names of the methods that are compared in a place."""
+    return [name for name, method in METHODS.items() if place in method.where]
+
+
+def of_group(group: str) -> list[str]:
+    """Return the names of the methods of a group."""
+    return [name for name, method in METHODS.items() if method.group == group]
+
+
+def with_numbers(place: str, numbers: Iterable[int]) -> list[tuple[str, int]]:
+    """Return (method, number of keypoints) for each number, 0 for no limit, in a place.
+
+    Those that the place has with the deciding number alone come last.
+    """
+    asked = {name: METHODS[name].where[place] for name in compared_in(place)}
+    each = [
+        (name, number)
+        for number in numbers
+        for name in asked
+        if (EACH if number else ALL) in asked[name]
+    ]
+    return each + [(name, DECIDING) for name in asked if DECIDING in asked[name]]

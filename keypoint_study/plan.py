@@ -9,7 +9,7 @@ from typing import Any
 
 import pandas as pd
 
-from keypoint_study import comparisons, jobs, runner, sources, worth
+from keypoint_study import comparisons, jobs, runner, sources, worth_runs
 from keypoint_study.sources import Source
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
@@ -171,23 +171,23 @@ class Study:
     def worths(
         self, folder: Path, processes: int = 1, scheduler: str | None = None
     ) -> pd.DataFrame | None:
-        """Return what a keypoint of each source is worth (`worth.worths_of`), without ground truth.
+        """Return what a keypoint of each source is worth (`worth_runs.worths_of`), without truth.
 
         What is in the folder is kept. None if no source has masks or keypoints. With a tested
         width, also of the controls.
         """
         if all(source.kind == "paths" for source in self.sources):
             return None
-        return worth.worths_of(
+        return worth_runs.worths_of(
             self.opened,
             self.sources,
             self.shown_width,
             folder / "worth",
-            processes=processes,
-            scheduler=scheduler,
             with_controls=self.tested is not None,
             masked_settings=self.masked_settings,
             named=self.controls,
+            processes=processes,
+            scheduler=scheduler,
         )
 
     @property

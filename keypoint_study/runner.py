@@ -1,7 +1,7 @@
 """The one runner: it makes the runs that have no result yet, and the table of all runs.
 
-They run here or on a cluster. Each finished run is one CSV file with one row a frame, and is not
-run again. Errors are computed from these files.
+They run here or on a cluster. What is measured is a path (PATH) or a worth (`worth_runs.WORTH`).
+Each finished run is one CSV file, which is not made again. Errors are computed from these files.
 """
 
 import json
@@ -11,23 +11,22 @@ from dataclasses import asdict, dataclass, replace
 from functools import cache
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 import pandas as pd
 
 from keypoint_study import comparisons
-from keypoint_study.controls import min_distance
+from keypoint_study.controls import min_distance, recorded
 from keypoint_study.jobs import Job, Run, repeated
-from keypoint_study.methods import METHODS
+from keypoint_study.methods import AS_MANY, METHODS, STUDY
 from keypoint_study.path_errors import path_errors
 from keypoint_study.sources import Source
 from thesis_repro import odometry
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.data.layout import layout_of
 from thesis_repro.errors import InputError, cause
-from thesis_repro.odometry import OdometrySettings
 from thesis_repro.odometry.estimators import COMPARED
 from thesis_repro.odometry.runs import is_flagged, poses_of
 from thesis_repro.running import program, provenance
@@ -35,9 +34,7 @@ from thesis_repro.running.code_used import digest_of_code
 from thesis_repro.running.files import progress, write_text
 from thesis_repro.running.workers import open_pool
 
-# tables whose entries a run may use: its record has the code of those that it used
-TABLES = ("thesis_repro.data.layout.LAYOUTS",)
-AS_MANY = 1.1  # controls keep as many keypoints if the ratio is within 1 / AS_MANY to this
+NEARLY = 1.1  # controls keep as many keypoints if the ratio is within 1 / NEARLY to this
 SETTINGS = "settings.json"  # of the runs in a folder
 # Passes for each of several workers. Every pass decodes and tracks anew: a sequence on two workers
 # takes 13 % more CPU time than in one pass, and with 4 pieces 35 %.
@@ -72,47 +69,71 @@ class Outcome:
         )
 
 
+class Measure(NamedTuple):
+    """What is measured of runs.
+
+    name: of the progress bar. code: the function whose module measures, for records. make: from
+    {job: run}, runs over one sequence, to {job: table of its file, or the reason why it has none}.
+    rows: from a job's file, when that was changed (ns), and the sequence to its rows of the table.
+    needs_truth: whether it needs true poses. divided: whether several workers may share a sequence;
+    not if its runs are compared with something that all of them share.
+    """
+
+    name: str
+    code: Callable
+    make: Callable[[Mapping[Job, Run]], dict[Job, pd.DataFrame | str]]
+    rows: Callable[[Job, Path, int, Sequence], list[dict[str, Any]]]
+    needs_truth: bool = True
+    divided: bool = True
+
+
 def run_all(
     runs: Mapping[Job, Run | str],
     folder: Path,
+    measure: Measure | None = None,
     *,
-    inputs: Mapping[str, Mapping[str, Any]] = {},
     processes: int = 1,
     scheduler: str | None = None,
 ) -> Outcome:
     """Run what has no result yet; returns the table of all runs and how many ran.
 
-    runs: {job: (sequence, settings, masks)}, or the reason why a job cannot run. masks: None,
-    `Masks`, or an object with a function `run(sequence, settings)` in place of the odometry. What
-    has `record()` and `paths` tells its settings and the files that it reads.
-    folder: for the results, one file a run. Results of another sequence or odometry in it are moved
-    aside; runs with other settings, masks or code of these are made again. inputs: what the results
-    of a sequence come from beside, by name.
+    runs: of `jobs.runs_of`; a text is the reason why a job cannot run. measure: PATH if not given.
+    folder: for the results, one file a run. Results of another sequence, measure or odometry in it
+    are moved aside; runs with other settings, masks or code of these are made again.
     processes, scheduler: see `workers.open_pool`; the results do not depend on them. The workers of
     a scheduler need this package, and all folders under the same paths. One thread a worker is
     best.
 
-    Runs over the same sequence share one or several passes (`odometry.run_many`), with the results
-    of separate runs. What is stopped repeats only the passes that it was in. A run that fails is
-    printed with its reason and does not stop others.
+    Runs over the same sequence share one or several passes, with the results of separate runs. What
+    is stopped repeats only the passes that it was in. A run that fails is printed with its reason
+    and does not stop others.
     Raises InputError if another process is using the folder, if all runs fail, or if a worker is
     lost.
     """
+    measure = measure or PATH
     reasons = {job: run for job, run in runs.items() if isinstance(run, str)}
     possible = {job: run for job, run in runs.items() if not isinstance(run, str)}
     sequences = {run.sequence.name: run.sequence for run in possible.values()}
     with provenance.claimed(folder):
         for name, sequence in sequences.items():
-            _stage(folder / name, sequence, inputs.get(name, {}))
+            if measure.needs_truth and not sequence.has_truth:
+                raise InputError(
+                    f"{sequence.poses_path}: no such file; without ground truth, sequence {name} has no "
+                    "errors to compare; leave it out (the odometry command runs it)"
+                )
+            versions = _versions(measure, sequence)
+            provenance.stage(folder / name, **versions, sequence=sequence.digest())
         _drop_changed(possible, folder)
         waiting = {job: run for job, run in possible.items() if not _file(folder, job).is_file()}
         with open_pool(processes, scheduler) as pool:
             calls = [
-                (of_pass, folder, _seen(of_pass, folder))
-                for of_pass in _in_passes(waiting, pool.size)
+                (measure, of_pass, folder, _seen(measure, of_pass, folder))
+                for of_pass in _in_passes(waiting, pool.size if measure.divided else 0)
             ]
-            frames = [sum(len(run.sequence) for run in of_pass.values()) for of_pass, *_ in calls]
-            with progress(None, "odometry", total=sum(frames), unit="frame") as bar:
+            frames = [
+                sum(len(run.sequence) for run in of_pass.values()) for _, of_pass, *_ in calls
+            ]
+            with progress(None, measure.name, total=sum(frames), unit="frame") as bar:
                 for count, failed in zip(frames, pool.run(_run_pass, calls), strict=True):
                     reasons |= failed
                     bar.update(count)
@@ -121,11 +142,10 @@ def run_all(
     for job, run in possible.items():
         path = _file(folder, job)
         if path.is_file():
-            numbers = _measures(path, path.stat().st_mtime_ns, run.sequence)
-            rows.append({"sequence": job.sequence, "run": job.name, **asdict(job), **numbers})
+            rows += measure.rows(job, path, path.stat().st_mtime_ns, run.sequence)
     if not rows:
         first = next(iter(reasons.values()))
-        raise InputError(f"all {len(runs)} odometry runs failed; the first: {first}")
+        raise InputError(f"all {len(runs)} runs failed; the first: {first}")
     made = sum(_file(folder, job).is_file() for job in waiting)
     return Outcome(pd.DataFrame(rows), made, reasons, warnings)
 
@@ -135,20 +155,10 @@ def _file(folder: Path, job: Job) -> Path:
     return folder / job.sequence / f"{job.name}.csv"
 
 
-def _stage(folder: Path, sequence: Sequence, inputs: Mapping[str, Any]) -> None:
-    """Move aside the results of another sequence, or of another odometry."""
-    if not sequence.has_truth:
-        raise InputError(
-            f"{sequence.poses_path}: no such file; without ground truth, sequence {sequence.name} has no "
-            "errors to compare; leave it out (the odometry command runs it)"
-        )
-    provenance.stage(folder, **_versions(sequence), sequence=sequence.digest(), **inputs)
-
-
-def _versions(sequence: Sequence, *used: Any) -> dict[str, Any]:
+def _versions(measure: Measure, sequence: Sequence, *used: Any) -> dict[str, Any]:
     """Return what the runs over a sequence depend on beside data: code, and other packages."""
     return {
-        "code": digest_of_code(_made, *reader_of(sequence), *used, without=TABLES),
+        "code": digest_of_code(measure.code, *reader_of(sequence), *used),
         **provenance.versions("opencv", "numpy", "numba"),
     }
 
@@ -159,16 +169,16 @@ def reader_of(sequence: Any) -> list[Any]:
     return [type(sequence), *([layout_of(folder)] if folder else [])]
 
 
-def record_of(settings: OdometrySettings, masks: Any, digest: Callable) -> dict[str, Any]:
-    """Return what a run or the worth of a choice depends on beside its sequence.
-
-    digest: `provenance.digest_of_files`, which may remember.
-    """
+def record_of(run: Run, digest: Callable = provenance.digest_of_files) -> dict[str, Any]:
+    """Return what a run depends on beside its sequence. digest: of files, which may remember."""
+    _, settings, masks, brought = run
+    parts = [part for part in (masks, brought) if part is not None]
+    paths = chain(*(getattr(part, "paths", ()) for part in parts))
     return {
         **settings.record(),
-        "masks": masks.record() if hasattr(masks, "record") else None,
-        "files": digest(tuple(dict.fromkeys(getattr(masks, "paths", ())))),
-        "code": digest_of_code(settings.detector, settings.estimator, masks, without=TABLES),
+        "masks": [recorded(part) for part in parts],
+        "files": digest(tuple(dict.fromkeys(paths))),
+        "code": digest_of_code(settings.detector, settings.estimator, *parts),
     }
 
 
@@ -177,10 +187,11 @@ def _drop_changed(runs: Mapping[Job, Run], folder: Path) -> None:
     digest = cache(provenance.digest_of_files)
     known: dict[Any, Any] = {}  # of runs that differ in numbers alone
     now: dict[str, dict[str, Any]] = {}
-    for job, (sequence, settings, masks) in runs.items():
-        key = id(settings.detector), id(settings.estimator), id(masks)
+    for job, run in runs.items():
+        sequence, settings, *rest = run
+        key = id(settings.detector), id(settings.estimator), *map(id, rest)
         if key not in known:
-            known[key] = record_of(settings, masks, digest)
+            known[key] = record_of(run, digest)
         record = {**known[key], **settings.record()}
         now.setdefault(sequence.name, {})[job.name] = json.loads(
             json.dumps(record, default=float)
@@ -188,9 +199,9 @@ def _drop_changed(runs: Mapping[Job, Run], folder: Path) -> None:
     for name, records in now.items():
         path = folder / name / SETTINGS
         before = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
-        for run, record in records.items():
-            if before.get(run, record) != record:
-                (folder / name / f"{run}.csv").unlink(missing_ok=True)
+        for of_run, record in records.items():
+            if before.get(of_run, record) != record:
+                (folder / name / f"{of_run}.csv").unlink(missing_ok=True)
         if before | records != before:
             write_text(path, json.dumps(before | records, indent=1))
 
@@ -200,17 +211,20 @@ def _in_passes(runs: Mapping[Job, Run], workers: int) -> list[dict[Job, Run]]:
 
     Each of several workers gets about PIECES passes, so that all end at about the same time. Runs
     with the same keypoints stay in one pass, where they share most of their work. A single worker
-    gets one pass a sequence. What runs in place of the odometry shares nothing.
+    gets one pass a sequence. What runs in place of the odometry shares nothing. workers: 0 if all
+    runs of a sequence must be in one pass; the longest sequence is then the first.
     """
     passes: list[dict[Job, Run]] = []
     groups: dict[str, dict[Any, dict[Job, Run]]] = {}  # of the same keypoints, by sequence
     for job, run in runs.items():
-        if hasattr(run.masks, "run"):
+        if run.brought and workers:
             passes.append({job: run})
             continue
         keypoints = id(run.masks), *run.settings.detection_values()
         groups.setdefault(job.sequence, {}).setdefault(keypoints, {})[job] = run
     lengths = {job.sequence: len(run.sequence) for job, run in runs.items()}
+    if not workers:
+        groups = dict(sorted(groups.items(), key=lambda each: -lengths[each[0]]))
     # work is measured in frames, of which a group of runs reads each once
     work = sum(lengths[name] * len(of_sequence) for name, of_sequence in groups.items())
     for name, by_keypoints in groups.items():
@@ -224,17 +238,19 @@ def _in_passes(runs: Mapping[Job, Run], workers: int) -> list[dict[Job, Run]]:
     return passes
 
 
-def _seen(runs: Mapping[Job, Run], folder: Path) -> dict[str, Any]:
+def _seen(measure: Measure, runs: Mapping[Job, Run], folder: Path) -> dict[str, Any]:
     """Return what a worker must see as the main process does: records, code and packages."""
-    ((sequence, _, _), *_) = runs.values()
+    ((sequence, *_), *_) = runs.values()
     used = chain(
-        *((run.settings.detector, run.settings.estimator, run.masks) for run in runs.values())
+        *((run.settings.detector, run.settings.estimator, *run[2:]) for run in runs.values())
     )
     record = provenance.record(folder / sequence.name)
-    return {"record": record, **_versions(sequence, *used)}
+    return {"record": record, **_versions(measure, sequence, *used)}
 
 
-def _run_pass(runs: dict[Job, Run], folder: Path, seen: dict[str, Any]) -> dict[Job, str]:
+def _run_pass(
+    measure: Measure, runs: dict[Job, Run], folder: Path, seen: dict[str, Any]
+) -> dict[Job, str]:
     """Make runs over one sequence in one pass, here or on another machine.
 
     seen: see `_seen`. Returns the reasons of the jobs that failed.
@@ -243,16 +259,16 @@ def _run_pass(runs: dict[Job, Run], folder: Path, seen: dict[str, Any]) -> dict[
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)  # the processes already use every core
     try:
-        if _seen(runs, folder) != seen:
+        if _seen(measure, runs, folder) != seen:
             raise InputError(
                 f"{folder}: this worker sees other files there, or has other code or versions of packages; "
                 "give all workers the same folders under the same paths and the same packages"
             )
-        for job, result in _made(runs).items():
+        for job, result in measure.make(runs).items():
             if isinstance(result, str):
                 reasons[job] = result
             else:
-                write_text(_file(folder, job), result.frames.to_csv(index=False))
+                write_text(_file(folder, job), result.to_csv(index=False))
     except Exception as error:
         unfinished = [job for job in runs if not _file(folder, job).is_file()]
         reasons = dict.fromkeys(unfinished, cause(error)) | reasons
@@ -261,41 +277,32 @@ def _run_pass(runs: dict[Job, Run], folder: Path, seen: dict[str, Any]) -> dict[
     return reasons
 
 
-def _made(runs: Mapping[Job, Run]) -> dict[Job, odometry.Result | str]:
-    """Return the results of runs over one sequence, or the reasons why they failed.
-
-    Every file of masks is read first, because a bad file in the middle would stop the whole pass.
-    """
-    made: dict[Job, odometry.Result | str] = {}
-    together: dict[Job, Any] = {}
-    known: set[Any] = set()
-    for job, (sequence, settings, masks) in runs.items():
-        try:
-            if hasattr(masks, "check_files"):
-                masks.check_files(known)
-        except InputError as error:
-            made[job] = str(error)
-            continue
-        if hasattr(masks, "run"):
-            made[job] = masks.run(sequence, settings)
-        else:
-            together[job] = settings, masks
+def _paths(runs: Mapping[Job, Run]) -> dict[Job, pd.DataFrame | str]:
+    """Return the frames of runs over one sequence, or the reasons why they failed."""
+    failed: dict[Job, str] = {}
+    together = {job: run for job, run in runs.items() if run.brought is None}
+    made = {job: run.brought.run(*run[:2]) for job, run in runs.items() if run.brought}
     if together:
-        made |= odometry.run_many(sequence, together)
-    for job, result in list(made.items()):
+        sequence = next(iter(together.values())).sequence
+        asked = {job: (run.settings, run.masks) for job, run in together.items()}
+        made |= odometry.run_many(sequence, asked, failed=failed)
+    for job, result in made.items():
         # without keypoints, the path is a point, whatever the method
-        if isinstance(result, str) or job.method == "paths":
-            continue
-        if result.frames["detected"].isna().all():
-            made[job] = (
-                f"sequence {sequence.name}: no frame has any structure (all are black, white or of one "
+        if job.method != "paths" and result.frames["detected"].isna().all():
+            failed[job] = (
+                f"sequence {job.sequence}: no frame has any structure (all are black, white or of one "
                 "gray); check how they were written"
             )
-    return made
+    return {job: failed.get(job) or made[job].frames for job in runs}
+
+
+def _rows_of_path(job: Job, path: Path, changed: int, sequence: Sequence) -> list[dict[str, Any]]:
+    measured = _measured(path, changed, sequence)
+    return [{"sequence": job.sequence, "run": job.name, **asdict(job), **measured}]
 
 
 @cache  # a study calls `run_all` again, with more jobs
-def _measures(path: Path, changed: int, sequence: Sequence) -> dict[str, Any]:
+def _measured(path: Path, changed: int, sequence: Sequence) -> dict[str, Any]:
     """Return what a table of runs has from the file of a run: errors, keypoints, flagged frames.
 
     changed: when the file was changed, ns. The errors are `path_errors`.
@@ -309,6 +316,9 @@ def _measures(path: Path, changed: int, sequence: Sequence) -> dict[str, Any]:
         "mean_keypoints": frames["detected"].mean(),
         "flagged": int(is_flagged(frames).sum()),
     }
+
+
+PATH = Measure("odometry", odometry.run_many, _paths, _rows_of_path)
 
 
 def _report(reasons: Mapping[Job, str]) -> list[str]:
@@ -333,11 +343,11 @@ def number_warnings(runs: pd.DataFrame, sources: Iterable[Source]) -> list[str]:
     for source in sources:
         wanted = comparisons.keypoints_left(runs, source.name)
         of_source = runs[runs["source"] == source.name]
-        for name in [name for name, method in METHODS.items() if method.as_many]:
+        for name in [n for n, method in METHODS.items() if AS_MANY in method.where.get(STUDY, ())]:
             rows = of_source[of_source["method"] == name]
             ratios = rows.groupby("sequence")["mean_keypoints"].mean() / wanted
             off = np.log(ratios.dropna()).abs()
-            if (off > np.log(AS_MANY)).any():
+            if (off > np.log(NEARLY)).any():
                 worst = off.idxmax()
                 lines.append(
                     f"sequence {worst} {source.name}: the control {METHODS[name].title} keeps "

@@ -13,6 +13,7 @@ NARROW_LEVEL = 90  # percent, of intervals within a margin: two one-sided tests 
 # With fewer sequences, all ratios lie on the same side of 1 by chance in more than 5 % of cases (2
 # / 2**n).
 MIN_SEQUENCES = 6
+DISAGREEING = 2  # new sequences on the other side of 1 than the others, of any quantity
 
 LOWER, HIGHER = "lower", "higher"
 LESS, MORE, AS_MUCH = "less", "more", "as much"
@@ -60,16 +61,20 @@ def verdict(
     sides: Iterable[int] = (),
     narrow: Iterable[tuple[str, float, float]] = (),
     fails_more: bool = False,
+    new_disagree: bool = False,
 ) -> str:
     """Return the word of a rule for an outcome on n sequences; TOO_FEW for fewer than six.
 
     sides: of each quantity, where its interval of LEVEL lies: -1 below 1, 1 above, 0 around it.
     narrow: (quantity, low, high) of the intervals of NARROW_LEVEL. fails_more: whether it fails on
-    more sequences than what it is compared with.
+    more sequences than what it is compared with. new_disagree: whether new sequences do (see
+    `disagree`), so that no side is told.
     """
     if n < MIN_SEQUENCES:
         return TOO_FEW
     sides = set(sides)
+    if new_disagree and sides in ({-1}, {1}):
+        return rule.otherwise
     if sides == {-1}:
         return rule.below
     if sides == {1}:
@@ -80,3 +85,11 @@ def verdict(
     if all(low > 1 for low, _ in ends):
         return rule.within
     return rule.under
+
+
+def disagree(typical: float, new: Iterable[float]) -> bool:
+    """Return whether new sequences, on which nothing was chosen, disagree with the others.
+
+    typical: the typical logarithm of the others. new: the logarithms of the new ones.
+    """
+    return sum(each * typical < 0 for each in new) >= DISAGREEING

@@ -11,11 +11,9 @@ The rule, which was fixed before the runs, and its limits are in docs/reading-re
 for its outcomes in `verdicts.WORTH`.
 """
 
-from collections.abc import Callable, Collection, Iterable, Mapping
-from dataclasses import replace
+from collections.abc import Callable, Mapping
 from functools import cache, partial
 from itertools import chain, product
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -23,13 +21,9 @@ import numpy as np
 import pandas as pd
 
 import opencv_exact
-from keypoint_study import jobs, one_fit, ratios, verdicts
-from keypoint_study.methods import METHODS, changed
-from keypoint_study.runner import TABLES, reader_of, record_of
-from keypoint_study.sources import UNMASKED, Source, own_calls
-from keypoint_study.verdicts import verdict
+from keypoint_study import one_fit
 from thesis_repro.data.kitti import Sequence
-from thesis_repro.errors import InputError, cause
+from thesis_repro.errors import InputError
 from thesis_repro.odometry import (
     THESIS,
     Calls,
@@ -39,25 +33,18 @@ from thesis_repro.odometry import (
     OdometrySettings,
     metrics,
 )
-from thesis_repro.odometry.keypoints import filled, spread
 from thesis_repro.odometry.loop import MIN_MATCHES, normalise
 from thesis_repro.odometry.refined.fit import RefinedMotion, fit, smaller_rotation
 from thesis_repro.odometry.runs import check, inside
 from thesis_repro.odometry.sharing import SharedCalls
-from thesis_repro.running import program, provenance
-from thesis_repro.running.code_used import digest_of_code
-from thesis_repro.running.files import progress
-from thesis_repro.running.workers import open_pool
 
 NUMBERS = (100, 200, 400)
-DECIDING = 400  # keypoints
 SPLITS, SEED = 12, 0  # splits of each kind
 FITS = 3  # draws for the measure of one fit
 FIELD = 2 * THESIS.window  # side of a field, pixels
 MAX_STEPS = 200  # of a sequence, at equal distances; no street of the tables has more
 MIN_RANDOM = 20  # random keypoints with which even a choice of fewer is compared
 NO_MOTION = 180.0  # degrees, the angle to a half without a motion
-FILL = 5  # keypoints in each of 16 x 5 fields of the frame, for masks that are filled
 MOTIONS = ("rotation", "direction")
 
 _RANDOM = ("", 0)  # the choice of all keypoints, from which the random ones are drawn
@@ -81,13 +68,15 @@ def worth_of(
     calls: Mapping[str, Calls] = {},
     splits: int | None = None,
     steps: int | None = None,
+    failed: dict[tuple[str, int], str] | None = None,
 ) -> pd.DataFrame:
     """Return what a keypoint of each choice is worth on a sequence.
 
     chosen: {(name, number): (settings, masks)}, as for `odometry.run_many`; so many keypoints are
     drawn from those that the settings and the masks leave, 0 for all of them. calls: of choices
     with own keypoints, by name. splits: of each kind, SPLITS if not given. steps: at most
-    so many, at equal distances, MAX_STEPS if not given.
+    so many, at equal distances, MAX_STEPS if not given. failed: gets the reasons of choices whose
+    masks cannot be read, and the others go on; without it, the first such InputError is raised.
 
     One row a choice, number and split ("fields", "points", or ONE_FIT): sequence, choice, number,
     split, steps; keypoints, the median number that was drawn; left, the median number that the
@@ -106,9 +95,10 @@ def worth_of(
     taken = min(len(long_enough), steps or MAX_STEPS)
     indices = long_enough[np.linspace(0, len(long_enough) - 1, taken).round().astype(int)]
     shared = SharedCalls()
-    rows = []
+    rows, failed_here = [], {} if failed is None else failed
     for index in indices:
-        random, of_choices = tracked(sequence, int(index), chosen, shared, calls)
+        chosen = {key: chosen[key] for key in chosen if key not in failed_here}
+        random, of_choices = tracked(sequence, int(index), chosen, shared, calls, failed)
         halves_of_random = cache(partial(_halves, random))
         for (name, number), tracks in of_choices.items():
             count = min(number or len(tracks.points), len(tracks.points))
@@ -122,6 +112,8 @@ def worth_of(
                 row = {"choice": name, "number": number, "split": split, "left": len(tracks.points)}
                 row |= halves
                 rows.append(row | {f"random_{name}": value for name, value in reference.items()})
+    if failed and not rows:
+        raise InputError(next(iter(failed.values())))
     medians = pd.DataFrame(rows).groupby(["choice", "number", "split"], sort=False).median()
     for name in MOTIONS:
         medians[name] = medians[f"random_{name}_variance"] / medians[f"{name}_variance"]
@@ -139,17 +131,29 @@ def tracked(
     chosen: Choices,
     shared: SharedCalls,
     calls: Mapping[str, Calls],
+    failed: dict[tuple[str, int], str] | None = None,
 ) -> tuple[Tracks, dict[tuple[str, int], Tracks]]:
-    """Return all keypoints of frame `index`, and those of each choice, tracked into the next."""
+    """Return all keypoints of frame `index`, and those of each choice, tracked into the next.
+
+    failed: see `worth_of`.
+    """
     frame, following = sequence.frame(index), sequence.frame(index + 1)
     frame.setflags(write=False)  # so that all choices share it
     visible = sequence.visible(index)
-    made = {id(masks): masks[index] for _, masks in chosen.values() if masks is not None}
+    made: dict[int, Any] = {id(None): None}
     everything = {_RANDOM: (THESIS, None), **chosen}
     points = {}
+    masks: Any
     for key, (settings, masks) in everything.items():
         detect = calls.get(key[0], shared.calls).detect
-        points[key] = detect(frame, settings, inside(visible, made.get(id(masks))))
+        try:
+            if id(masks) not in made:
+                made[id(masks)] = masks[index]
+            points[key] = detect(frame, settings, inside(visible, made[id(masks)]))
+        except InputError as error:
+            if failed is None:
+                raise
+            failed[key] = str(error)
     # those of all choices, at once
     shared.expect(following, [SimpleNamespace(points=p, previous=frame) for p in points.values()])
     tracks = {}
@@ -237,168 +241,3 @@ def _angles(first: Motion | None, second: Motion | None) -> tuple[float, float]:
     sine = np.linalg.norm(np.cross(first.translation, second.translation))
     direction = np.degrees(np.arctan2(sine, first.translation @ second.translation))
     return float(rotation), float(direction)
-
-
-# The choices of a study
-
-
-def choices_of(
-    sequence: Sequence,
-    sources: Iterable[Source],
-    width: int | None,
-    numbers: Iterable[int] = (DECIDING,),
-    with_controls: bool = True,
-    masked_settings: Mapping[str, Any] = {},
-    named: Collection[str] = (),
-) -> Choices:
-    """Return the choices of a study for `worth_of`.
-
-    numbers: see `worth_of`. Random and spread keypoints, masks and own keypoints have each of them,
-    the other choices only DECIDING. with_controls: also masks that are filled, and the controls of
-    `jobs.mask_controls`; named: see there.
-    """
-    chosen: dict[tuple[str, int], tuple] = {}
-    for number in numbers:
-        chosen["random keypoints", number] = THESIS, None
-        if number:
-            chosen["spread keypoints", number] = replace(THESIS, detector=spread(number)), None
-    chosen["strongest keypoints", DECIDING] = replace(THESIS, max_keypoints=DECIDING), None
-    masked = replace(THESIS, **masked_settings)
-    for source in sources:
-        prefix = f"{source.name}: " if source.name else ""
-        if source.kind == "keypoints":
-            chosen |= {(source.name, number): (THESIS, None) for number in numbers}
-        if source.kind in UNMASKED:
-            continue
-        masks = source.masks(sequence, width)
-        chosen |= {(f"{prefix}masks", number): (masked, masks) for number in numbers}
-        strongest = replace(masked, max_keypoints=DECIDING)
-        chosen[f"{prefix}strongest on the masks", DECIDING] = strongest, masks
-        if with_controls:
-            more = replace(masked, detector=filled(FILL, masked.detector))
-            chosen[f"{prefix}masks, filled", DECIDING] = more, masks
-            controls = jobs.mask_controls(source, sequence, width, named)
-            for name, width_of_control in controls.items():
-                settings, control = METHODS[name].choose(sequence, source, width_of_control)
-                settings = changed(settings, masked_settings)
-                chosen[prefix + METHODS[name].title, DECIDING] = settings, control
-    return chosen
-
-
-def worths_of(
-    sequences: Iterable[Sequence],
-    sources: Iterable[Source],
-    width: int | None,
-    folder: Path,
-    numbers: Iterable[int] = (DECIDING,),
-    processes: int = 1,
-    scheduler: str | None = None,
-    **options: Any,
-) -> pd.DataFrame:
-    """Return the table of `worth_of` for the `choices_of` sources; what is in the folder is kept.
-
-    width: pixels, of masks from label maps. processes, scheduler: see `workers.open_pool`.
-    options: of `choices_of`. A sequence without a result is left out with a warning. Raises
-    InputError if none has one.
-    """
-    sources, numbers = list(sources), list(numbers)
-    digest = cache(provenance.digest_of_files)
-    own = {source.name: source.folder for source in sources if source.kind == "keypoints"}
-    calls: list[tuple] = []
-    for sequence in sequences:
-        chosen = choices_of(sequence, sources, width, numbers, **options)
-        records = {
-            f"{name} {number}": record_of(*chosen[name, number], digest) for name, number in chosen
-        }
-        stage = provenance.stage(
-            folder / sequence.name,
-            sequence=sequence.digest(),
-            choices=records,
-            own={name: digest((file,)) for name, file in own.items()},
-            code=digest_of_code(_measure_one, *reader_of(sequence), without=TABLES),
-            **provenance.versions("opencv", "numpy", "numba"),
-        )
-        calls.append((stage / "worth.csv", sequence, chosen, own))
-    missing = [call for call in calls if not call[0].is_file()]
-    missing.sort(key=lambda call: -len(call[1]))  # so that no process waits long for the last one
-    # the first step of a sequence compiles, so it says nothing about the time of the others
-    steps = [min(len(sequence), MAX_STEPS) for _, sequence, *_ in missing]
-    reasons = []
-    with (
-        open_pool(processes, scheduler) as pool,
-        progress(None, "worth of keypoints", total=sum(steps), unit="step") as bar,
-    ):
-        for count, reason in zip(steps, pool.run(_measure_one, missing), strict=True):
-            if reason:
-                reasons.append(reason)
-            bar.update(count)
-    tables = [pd.read_csv(file, dtype={"sequence": str}) for file, *_ in calls if file.is_file()]
-    if not tables:
-        raise InputError(reasons[0])
-    for reason in reasons:
-        program.log.warning(f"{reason}; it has no worth of keypoints")
-    return pd.concat(tables, ignore_index=True)
-
-
-def _measure_one(file: Path, sequence: Sequence, chosen: Choices, own: Mapping[str, Path]) -> str:
-    """Write the table of `worth_of`; return the reason if there is none."""
-    try:
-        table = worth_of(sequence, chosen, {name: own_calls(path) for name, path in own.items()})
-    except InputError as error:
-        return str(error)
-    except Exception as error:  # of own keypoints
-        return f"sequence {sequence.name}: {cause(error)}"
-    provenance.write_table(file, table)
-    return ""
-
-
-# Over several streets
-
-
-def typical_worths(table: pd.DataFrame) -> pd.DataFrame:
-    """Return the typical worth of each choice and number over the sequences, and its verdict.
-
-    table: of `worth_of`, of several sequences. One row a choice and number: keypoints, n
-    (sequences), verdict; for each motion and split, such as rotation_fields: the typical worth, its
-    interval (_low, _high), and the number of sequences with a worth below 1 (_below).
-    verdict_of_fit: that of the second measure, which decides nothing.
-    """
-    rows = []
-    for (choice, number), chosen in table.groupby(["choice", "number"], sort=False):
-        row = {"choice": choice, "number": number, "keypoints": chosen["keypoints"].mean()}
-        worths: dict[str, pd.Series] = {}
-        for motion in MOTIONS:
-            for split, of_split in chosen.groupby("split", sort=False):
-                worths[f"{motion}_{split}"] = np.log(of_split[motion])
-        of_fit = {name: worths[name] for name in worths if name.endswith(ONE_FIT)}
-        of_halves = {name: worths[name] for name in worths if name not in of_fit}
-        row |= {"n": chosen["sequence"].nunique(), "verdict": _verdict(of_halves)}
-        if of_fit:
-            row["verdict_of_fit"] = _verdict(of_fit)
-        for name, logarithms in worths.items():
-            numbers = np.exp(ratios.typical_interval(logarithms))
-            row |= dict(zip((name, f"{name}_low", f"{name}_high"), numbers, strict=True))
-            row[f"{name}_below"] = int((logarithms < 0).sum())
-        rows.append(row)
-    return pd.DataFrame(rows)
-
-
-def over(table: pd.DataFrame, choice: str, other: str) -> pd.DataFrame:
-    """Return the worths of one choice divided by those of another, as rows of the same table."""
-    keys, names = ["sequence", "number", "split"], list(MOTIONS)
-    first, second = (table[table["choice"] == name].set_index(keys) for name in (choice, other))
-    divided = (first[names] / second[names]).dropna()
-    rows = first.loc[divided.index].assign(choice=f"{choice}, over {other}", **divided)
-    return rows.reset_index()[list(table)]
-
-
-def _verdict(worths: Mapping[str, pd.Series]) -> str:
-    """Return the verdict on the logarithms of the worths of both motions and splits, by name."""
-    fewest = min(map(len, worths.values()))
-    intervals = [ratios.typical_interval(each)[1:] for each in worths.values()]
-    sides = [ratios.side_of_one(*np.exp(ends)) for ends in intervals]
-    narrow = [
-        (name.partition("_")[0], *ratios.narrow_interval(np.exp(each)))
-        for name, each in worths.items()
-    ]
-    return verdict(verdicts.WORTH, fewest, sides, narrow)

@@ -24,7 +24,7 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from keypoint_study import controls, methods
+from keypoint_study import methods
 from keypoint_study.sources import Source
 from thesis.settings import ROOT
 from thesis_repro import masks, odometry
@@ -122,7 +122,7 @@ def mask_cost(sequence, labels):
     source, costs = Source(labels), np.zeros(2)
     kinds = [source.masks(sequence, width) for width in WIDTHS]
     for name in set(methods.MASK_CONTROLS) - {"true-labels"}:
-        _, control = methods.METHODS[name].choose(sequence, source, controls.LINE_WIDTH)
+        _, control = methods.METHODS[name].choose(methods.Asked(sequence, source))
         kinds += [control] * (control is not None)  # a method may have settings alone
     for index in range(len(sequence)):
         for column, forget in enumerate((lambda: None, folders.forget_edges)):

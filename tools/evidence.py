@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from keypoint_study import comparisons, jobs, ratios, runner, worth
+from keypoint_study import comparisons, jobs, ratios, runner, worth_runs
 from keypoint_study.methods import EXPLORED, IN_PLACE, METHODS
 from keypoint_study.report import style, texts
 from keypoint_study.report import worths as report_worths
@@ -75,12 +75,12 @@ def write(settings, folder):
             sequences, labels, few_folder, settings.jobs, few_keypoints.REPETITIONS
         ),
         "their times": lambda: few_keypoints.time_steps(sequences[0], labels, few_folder),
-        "worth of a keypoint": lambda: worth.worths_of(
+        "worth of a keypoint": lambda: worth_runs.worths_of(
             sequences,
             [Source(labels)],
             jobs.CONTROL_WIDTH,
             settings.build / "worth",
-            (worth.DECIDING, 0, 200, 100),
+            (worth_runs.DECIDING, 0, 200, 100),
             settings.jobs,
             named=tuple(EXPLORED),
         ),
@@ -101,7 +101,10 @@ def write(settings, folder):
     (folder / "audit.md").unlink()  # the page beside the gallery has its numbers, too
     style.save_figure(few_keypoints.figure_of_few(few), folder, "few_keypoints", note)
     told = not_explored(worths)
-    for artefact in (report_worths.figure_of_worths(told), report_worths.table_of_worths(told)):
+    for artefact in (
+        report_worths.figure_of_worths(told),
+        report_worths.table_of_worths(told, NEW_STREETS),
+    ):
         style.save(artefact, folder, note)
     for_readers = {
         "streets": streets,
@@ -194,23 +197,23 @@ def table_of_places(worths):
     titles = {name: METHODS[name].title for name in METHODS}
     of_masks = ["masked", "exact-boundaries", "mirrored"]
     shown = [titles[name] for name in (*of_masks, *IN_PLACE)]
-    divided = [worth.over(worths, titles[name], titles[f"beside-{name}"]) for name in of_masks]
-    chosen = worths[worths["choice"].isin(shown) & (worths["number"] == worth.DECIDING)]
-    decisive = [rows[rows["number"] == worth.DECIDING] for rows in divided]
-    return report_worths.table_of_worths(pd.concat([chosen, *decisive])).content
+    divided = [worth_runs.over(worths, titles[name], titles[f"beside-{name}"]) for name in of_masks]
+    chosen = worths[worths["choice"].isin(shown) & (worths["number"] == worth_runs.DECIDING)]
+    decisive = [rows[rows["number"] == worth_runs.DECIDING] for rows in divided]
+    return report_worths.table_of_worths(pd.concat([chosen, *decisive]), NEW_STREETS).content
 
 
 def table_of_classes(worths):
     """Return what random keypoints tell without those on one class."""
     titles = [method.title for name, method in EXPLORED.items() if name not in IN_PLACE]
-    return report_worths.table_of_worths(worths[worths["choice"].isin(titles)]).content
+    return report_worths.table_of_worths(worths[worths["choice"].isin(titles)], NEW_STREETS).content
 
 
 def table_of_new_streets(worths):
     """Return the worths, by fields, on the streets that nothing was chosen on: one row each."""
     choices = ["random keypoints", "spread keypoints", "masks"]
     rows = worths[worths["sequence"].isin(NEW_STREETS) & worths["choice"].isin(choices)]
-    rows = rows[(rows["split"] == "fields") & (rows["number"] == worth.DECIDING)]
+    rows = rows[(rows["split"] == "fields") & (rows["number"] == worth_runs.DECIDING)]
     columns = ["sequence", "choice", "keypoints", "direction", "rotation"]
     return rows[columns].round({"direction": 2, "rotation": 2}).sort_values(columns[:2])
 

@@ -9,10 +9,9 @@ from functools import cache
 from itertools import product
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
-from keypoint_study import comparisons, ratios, verdicts
+from keypoint_study import comparisons, ratios, verdicts, worth_runs
 from keypoint_study import worth as worths
 from keypoint_study.report import texts
 from thesis import few_keypoints
@@ -113,21 +112,17 @@ def worth(
     """Return ratio, low, high, below, n and verdict of the worth of one of so many keypoints.
 
     choice: as in the tables, or two, "masks / beside the masks", for the one divided by the other.
-    where: which streets. of_fit: the verdict of the second measure. Without `where`, a verdict that
-    new streets do not share is no clear difference (docs/reading-results.md).
+    where: which streets, without the rule for new ones. of_fit: the verdict of the second measure.
     """
     rows = read_table(f"{REAL}worth_runs").query("number == @number")
     first, _, other = choice.partition(" / ")
-    rows = worths.over(rows, first, other) if other else rows.query("choice == @choice")
-    (row,) = worths.typical_worths(rows.query(where) if where else rows).to_dict("records")
+    rows = worth_runs.over(rows, first, other) if other else rows.query("choice == @choice")
+    new = () if where else read_table(f"{REAL}new_streets")["sequence"]
+    (row,) = worth_runs.typical_worths(rows.query(where) if where else rows, new).to_dict("records")
     name = f"{motion}_{split}"
     ends = {end: row[f"{name}_{end}"] for end in ("low", "high", "below")}
-    told = row["verdict"]
-    is_told = told in (verdicts.LESS, verdicts.MORE) and not (where or other)
-    if is_told and new_streets_disagree(choice):
-        told = verdicts.NO_CLEAR_DIFFERENCE
     of_fit = row.get("verdict_of_fit")
-    return {"ratio": row[name], **ends, "n": row["n"], "verdict": told, "of_fit": of_fit}
+    return {"ratio": row[name], **ends, "n": row["n"], "verdict": row["verdict"], "of_fit": of_fit}
 
 
 def random_apart(number: int) -> list[str]:
@@ -160,15 +155,9 @@ def new_streets() -> str:
 
 
 def new_streets_disagree(choice: str) -> bool:
-    """Whether two of the new streets lie on the other side of 1 than the others, by fields."""
-    rows = read_table(f"{REAL}worth_runs").query("number == 400 and split == 'fields'")
-    rows = rows.query("choice == @choice")
-    new, others = rows.query(new_streets()), rows.query(f"not ({new_streets()})")
-    for motion in worths.MOTIONS:
-        typical = ratios.typical_interval(np.log(others[motion]))[0]
-        if (np.sign(np.log(new[motion])) == -np.sign(typical)).sum() >= 2:
-            return True
-    return False
+    """Whether the new streets disagree with the others on a choice (`worth_runs`)."""
+    rows = read_table(f"{REAL}worth_runs").query("number == 400 and choice == @choice")
+    return worth_runs.new_disagree(rows, read_table(f"{REAL}new_streets")["sequence"])
 
 
 def on_new_streets(choice: str, motion: str) -> str:

@@ -10,8 +10,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 
-from keypoint_study import comparisons, controls, runner
+from keypoint_study import comparisons, runner
 from keypoint_study.jobs import ESTIMATORS
+from keypoint_study.methods import CONTROL_WIDTH
 from keypoint_study.plan import RUNS, Study
 from keypoint_study.report import comparison, html, latex, style, worths
 from keypoint_study.report.findings import findings_of
@@ -87,7 +88,7 @@ def write(
         embedded=embedded,
         kinds=KINDS,
         estimators=ESTIMATORS,
-        line_width=controls.LINE_WIDTH,
+        line_width=CONTROL_WIDTH,
         changed=changed,
         widths=sorted(runs["dilation_width"].dropna().astype(int).unique()),
     )

@@ -1,28 +1,32 @@
 """Table and figure of what a keypoint of each choice is worth (keypoint_study/worth.py)."""
 
+from collections.abc import Collection
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from keypoint_study import ratios
+from keypoint_study.methods import DECIDING
 from keypoint_study.report import style, texts
 from keypoint_study.report.style import COLUMN_WIDTH, PAGE_WIDTH, Artefact
 from keypoint_study.verdicts import LEVEL, MIN_SEQUENCES
-from keypoint_study.worth import DECIDING, FIELD, SPLIT, typical_worths
+from keypoint_study.worth import FIELD, SPLIT
+from keypoint_study.worth_runs import typical_worths
 
 SHOWN = ("direction", "rotation")
 REACH = 8  # of the figure's axis, from 1 / REACH to REACH; a street beyond it is drawn at the edge
 DOT: dict[str, Any] = {"color": "#555555", "markersize": 4, "alpha": 0.45, "markeredgewidth": 0}
 
 
-def table_of_worths(worths: pd.DataFrame) -> Artefact:
+def table_of_worths(worths: pd.DataFrame, new: Collection[str] = ()) -> Artefact:
     """Return one row a choice and number, for readers: typical worths, intervals and the verdict.
 
-    worths: of `worth.worths_of`. A cell says "0.51 (0.20-0.67), 7 of 8 below 1".
+    worths: of `worth_runs.worths_of`. new: sequences, see `worth_runs.typical_worths`.
+    A cell says "0.51 (0.20-0.67), 7 of 8 below 1".
     """
     lines = []
-    for row in typical_worths(worths).to_dict("records"):
+    for row in typical_worths(worths, new).to_dict("records"):
         line = {
             "choice": row["choice"],
             "drawn": row["number"] or "all",
@@ -56,7 +60,7 @@ def for_paper(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def cell(row: dict, name: str) -> str:
-    """Return a typical worth of `worth.typical_worths` as text."""
+    """Return a typical worth of `worth_runs.typical_worths` as text."""
     ends = {end: row[f"{name}_{end}"] for end in ("low", "high")}
     return (
         f"{texts.short({'ratio': row[name], **ends})}, {row[f'{name}_below']} of {row['n']} below 1"

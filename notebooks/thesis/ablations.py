@@ -4,10 +4,6 @@ Every run differs from a reference run in one setting. The tables have the colum
 `comparisons` needs.
 """
 
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, replace
-from functools import lru_cache, partial
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -15,215 +11,42 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from keypoint_study.jobs import CONTROL_WIDTH, Job, Run
-from keypoint_study.methods import Choice, changed
+from keypoint_study.jobs import Job, repeated, runs_of
+from keypoint_study.methods import ABLATIONS, compared_in
 from keypoint_study.runner import run_all, run_poses
+from keypoint_study.sources import Source
 from thesis_repro import masks
-from thesis_repro.data.cityscapes import ID, read_label_map, resize_bilinear
+from thesis_repro.data.cityscapes import ID, resize_bilinear
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.masks import MaskSettings
-from thesis_repro.masks.folders import LabelMasks
-from thesis_repro.odometry import THESIS, keypoints, metrics
+from thesis_repro.odometry import THESIS, metrics
 from thesis_repro.odometry.loop import detect, normalise, track
-from thesis_repro.running import provenance
 
 ESTIMATORS = ("thesis", "inliers", "refined")  # a new one is compared when it is named here
-VEGETATION = (ID["vegetation"], ID["terrain"])
-# pixels that are kept; the first two leave out distant points, the last near ones
-PARALLAX = {"parallax-1": (1, np.inf), "parallax-3": (3, np.inf), "parallax-20": (0, 20)}
-FEW_KEYPOINTS = (100, 200, 400)  # a twentieth, a tenth and a fifth of the thesis's 2000
-
-
-@dataclass(frozen=True)
-class FunctionMasks:
-    """Masks made by a function of the frame number: masks[i] for frame i."""
-
-    function: Callable[[int], np.ndarray]
-
-    def __getitem__(self, index: int) -> np.ndarray:
-        return self.function(index)
-
-
-@lru_cache(maxsize=2)  # several masks of one frame use it
-def all_keypoints(sequence: Sequence, index: int) -> np.ndarray:
-    """Return the thesis's keypoints (n, 2) of a frame."""
-    return detect(sequence.frame(index), THESIS)
-
-
-def random_keypoints(sequence: Sequence, amount: int | float, index: int) -> np.ndarray:
-    """Return a mask that keeps randomly drawn keypoints of a frame, one pixel each.
-
-    amount: their number (int), or their share of all keypoints (float).
-    """
-    points = all_keypoints(sequence, index).astype(int)
-    if isinstance(amount, float):
-        amount = round(amount * len(points))
-    shuffled = np.random.default_rng((0, index)).permutation(points)
-    columns, rows = shuffled[:amount].T
-    mask = np.zeros(sequence.size, np.uint8)
-    mask[rows, columns] = 255
-    return mask
-
-
-@lru_cache(maxsize=2)  # several masks of one frame use it
-def parallax(sequence: Sequence, index: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the keypoints (n, 2) of a frame that are tracked into the next, and their parallax.
-
-    Parallax (pixels): how far a point moves beyond what the true rotation explains. It is large for
-    near points and small for distant ones. Uses the ground truth, which an odometry does not have.
-    """
-    points = all_keypoints(sequence, index)
-    moved, tracked = track(sequence.frame(index), sequence.frame(index + 1), points)
-    motion = np.linalg.inv(sequence.poses[index]) @ sequence.poses[index + 1]
-    rays = np.column_stack([normalise(points, sequence.intrinsics), np.ones(len(points))])
-    turned = rays @ motion[:3, :3] @ sequence.intrinsics.T  # of points at infinity
-    distances = np.linalg.norm(moved - turned[:, :2] / turned[:, 2:], axis=1)
-    return points[tracked], distances[tracked]
-
-
-def with_parallax(sequence: Sequence, least: float, most: float, index: int) -> np.ndarray:
-    """Return a mask that keeps the keypoints with a parallax in a range, one pixel each.
-
-    (Section 5.2.2: keypoints that are far away, or close to the camera, are left out.)
-    """
-    mask = np.zeros(sequence.size, np.uint8)
-    if index + 1 < len(sequence):  # those of the last frame are not used
-        points, distances = parallax(sequence, index)
-        columns, rows = points[(distances >= least) & (distances < most)].astype(int).T
-        mask[rows, columns] = 255
-    return mask
-
-
-def as_many(sequence: Sequence, least: float, most: float, index: int) -> np.ndarray:
-    """Return a mask that keeps as many keypoints as `with_parallax`, drawn at random."""
-    number = int(np.count_nonzero(with_parallax(sequence, least, most, index)))
-    return random_keypoints(sequence, number, index)
-
-
-def half_in_turns(sequence: Sequence, into: bool, index: int) -> np.ndarray:
-    """Return a mask that keeps one half of the frame in a turn, and elsewhere all of it.
-
-    into: whether it is the half that the camera turns into (Section 5.2.2). Which steps turn is
-    known from the ground truth (`metrics.TURN_RATE`).
-    """
-    mask = np.full(sequence.size, 255, np.uint8)
-    following = sequence.poses[index : index + 2]
-    motion = np.linalg.inv(following[0]) @ following[-1]
-    if metrics.angles(motion) > metrics.TURN_RATE:
-        middle = sequence.size[1] // 2
-        turns_right = motion[0, 2] > 0  # the optical axis moves to the right
-        mask[np.s_[:, :middle] if turns_right == into else np.s_[:, middle:]] = 0
-    return mask
-
-
-# The runs
-
-
-def run_choices(
-    choices: Callable[[Sequence], Mapping[str, Choice]],
-    sequences: Iterable[Sequence],
-    labels: Path,
-    folder: Path,
-    code: str,
-    estimators: Iterable[str],
-    repetitions: int = 1,
-    processes: int = 1,
-) -> pd.DataFrame:
-    """Run choices of keypoints on sequences by `runner.run_all`; returns a table, one row a run.
-
-    choices: a function of a sequence that returns {method: (settings, masks)}. labels: a folder
-    with one folder of label maps a sequence. folder: for the results; those made from the same
-    label maps and by the same code, the file of `choices`, are not made again. A repetition other
-    than 0 is the seed that shuffles the matched points. The estimator "inliers" is run for all
-    keypoints and masks alone.
-    """
-    runs: dict[Job, Run | str] = {}
-    inputs = {}
-    for sequence in sequences:
-        maps = [labels / sequence.name / path.name for path in sequence.frame_paths]
-        inputs[sequence.name] = {
-            "choices": provenance.digest_of_file(code),
-            "labels": provenance.digest_of_files(maps),
-        }
-        for (method, (settings, given)), estimator, repetition in product(
-            choices(sequence).items(), estimators, range(repetitions)
-        ):
-            if estimator != "inliers" or method in ("baseline", "masked"):
-                job = Job(sequence.name, method, estimator=estimator, repetition=repetition)
-                runs[job] = Run(sequence, changed(settings, job.changes()), given)
-    return run_all(runs, folder, inputs=inputs, processes=processes).table
 
 
 def run_ablations(
     sequences: list[Sequence], labels: Path, folder: Path, repetitions: int = 1, processes: int = 1
 ) -> pd.DataFrame:
-    """Run every ablation on every sequence with ESTIMATORS, see `run_choices`.
+    """Run the ablations of `methods.METHODS` on every sequence with ESTIMATORS.
 
+    labels: a folder with one folder of label maps a sequence. folder: for the results. The
+    estimator "inliers" is run for all keypoints and masks alone.
     Columns: sequence, method, estimator, repetition, those of `runner.run_all`, and sim3 (RMSE in
     metres after an alignment with scale).
     """
-    table = run_choices(
-        lambda sequence: choices(sequence, labels),
-        sequences,
-        labels,
-        folder,
-        __file__,
-        ESTIMATORS,
-        repetitions,
-        processes,
-    )
+    named = [Job(sequence.name, name) for sequence in sequences for name in compared_in(ABLATIONS)]
+    jobs = [
+        job
+        for job in repeated(named, ESTIMATORS, repetitions)
+        if job.estimator != "inliers" or job.method in ("baseline", "masked")
+    ]
+    table = run_all(runs_of(jobs, sequences, [Source(labels)]), folder, processes=processes).table
     poses = run_poses(table, folder)
     true = {sequence.name: sequence.poses for sequence in sequences}
     pairs = zip(table["sequence"], table["run"])
     table["sim3"] = [metrics.ate(poses[name, run], true[name], "sim3") for name, run in pairs]
     return table
-
-
-def choices(sequence: Sequence, labels: Path) -> dict[str, Choice]:
-    """Return the ablations over one sequence: {method: (settings, masks)}.
-
-    labels: a folder with one folder of label maps a sequence.
-    """
-
-    def enlarged(index: int) -> np.ndarray:
-        label_map = read_label_map(thesis_masks.paths[index])
-        return cv2.resize(label_map, sequence.size[::-1], interpolation=cv2.INTER_NEAREST)
-
-    def nearest(index: int) -> np.ndarray:
-        return masks.dilate(cv2.Canny(enlarged(index), *masks.CANNY), CONTROL_WIDTH)
-
-    def without_vegetation(index: int) -> np.ndarray:
-        return np.where(np.isin(enlarged(index), VEGETATION), np.uint8(0), np.uint8(255))
-
-    def random(amount: int | float) -> Choice:
-        return THESIS, FunctionMasks(partial(random_keypoints, sequence, amount))
-
-    thesis_masks = LabelMasks(labels, sequence, CONTROL_WIDTH)
-    symmetric = LabelMasks(labels, sequence, CONTROL_WIDTH, MaskSettings(symmetric=True))
-    some_frames = range(0, len(sequence), max(1, len(sequence) // 8))
-    numbers = [len(detect(sequence.frame(i), THESIS, thesis_masks[i])) for i in some_frames]
-    number = round(np.mean(numbers))  # that masks leave
-    methods: dict[str, Choice] = {
-        "baseline": (THESIS, None),
-        "masked": (THESIS, thesis_masks),
-        "filter": (replace(THESIS, detector=keypoints.filtered), thesis_masks),
-        "nearest": (THESIS, FunctionMasks(nearest)),
-        "symmetric": (THESIS, symmetric),
-        # Section 5.2.2: trees and bushes
-        "no-vegetation": (THESIS, FunctionMasks(without_vegetation)),
-        "strongest": (replace(THESIS, max_keypoints=max(1, number)), None),
-        "random": random(number),
-        "dropout": random(0.9),
-    }
-    for few in FEW_KEYPOINTS:
-        methods[f"strongest-{few}"] = replace(THESIS, max_keypoints=few), None
-    for name, span in PARALLAX.items():
-        for prefix, function in {"": with_parallax, "as many as ": as_many}.items():
-            chosen = FunctionMasks(partial(function, sequence, *span))
-            methods[prefix + name] = THESIS, chosen
-    for name, into in {"turned-into": True, "turned-from": False}.items():
-        methods[name] = THESIS, FunctionMasks(partial(half_in_turns, sequence, into))
-    return methods | {"orb": (replace(THESIS, detector=keypoints.orb), None)}
 
 
 # Keypoints and boundaries one by one

@@ -12,7 +12,7 @@ import pandas as pd
 from cv2 import INTER_NEAREST, resize
 
 from keypoint_study.jobs import CONTROL_WIDTH
-from keypoint_study.methods import METHODS
+from keypoint_study.methods import METHODS, Asked
 from keypoint_study.sources import Source
 from thesis import ablations, artefacts, audit_of_tables, domain_gap, timing
 from thesis.audit import measurement
@@ -79,7 +79,7 @@ def masks_by_name(drive: Sequence, labels: Path) -> dict[str, Any]:
         "all keypoints": [None] * len(drive),
         "masks": LabelMasks(own_folder, drive, CONTROL_WIDTH),
         "exact boundaries": LabelMasks(own_folder, drive, CONTROL_WIDTH, ablations.EXACT),
-        "random lines": METHODS["random-lines"].choose(drive, Source(labels), CONTROL_WIDTH)[1],
+        "random lines": METHODS["random-lines"].choose(Asked(drive, Source(labels)))[1],
     }
     if true_folder.is_dir():
         by_name["true label maps"] = LabelMasks(true_folder, drive, CONTROL_WIDTH)

@@ -8,8 +8,6 @@ show, but when a prototype's results on the same streets were known.
 """
 
 from collections.abc import Iterable
-from dataclasses import replace
-from functools import partial
 from itertools import product
 from pathlib import Path
 from time import process_time
@@ -22,26 +20,25 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from keypoint_study import comparisons, jobs, ratios
-from keypoint_study.jobs import CONTROL_WIDTH
+from keypoint_study.jobs import Job, repeated, runs_of
+from keypoint_study.methods import FEW, FILL, METHODS, compared_in, with_numbers
 from keypoint_study.report import style, texts
+from keypoint_study.runner import run_all
+from keypoint_study.sources import Source
 from keypoint_study.verdicts import FEW_KEYPOINTS, verdict
-from keypoint_study.worth import FILL
-from thesis.ablations import FunctionMasks, random_keypoints, run_choices
 from thesis_repro import odometry
 from thesis_repro.data.kitti import Sequence
-from thesis_repro.masks.folders import LabelMasks
-from thesis_repro.odometry import THESIS
-from thesis_repro.odometry.keypoints import filled, spread
 from thesis_repro.running import provenance
 
 ESTIMATORS = {name: jobs.ESTIMATORS[name] for name in ("thesis", "refined")}  # of the verdict
 NUMBERS = (50, 100, 200, 400, 800)
 REPETITIONS = 4  # three of them with the matched points shuffled
 TIMED_RUNS = 5
-LABELS = {
-    "all": "all keypoints",
+# {method: its name in the tables}, if that is another one
+CALLED = {"baseline": "all", "strongest-on": "mask", "spread-anywhere": "spread"}
+# {name in the tables: title}. A new method has the title that METHODS gives it.
+LABELS = {CALLED.get(name, name): METHODS[name].title for name in compared_in(FEW)} | {
     "strongest": "the strongest",
-    "random": "random ones",
     "spread": "spread over the frame",
     "mask": "the strongest on the mask",
     "filled": f"mask, filled to {FILL} a field",
@@ -61,29 +58,26 @@ COLUMNS = (
 NEAR = 0.8, 1.5  # of the panels that show ratios near 1 enlarged
 
 
-def choices(
-    sequence: Sequence, labels: Path, numbers: Iterable[int] = ()
-) -> dict[tuple[str, int], tuple]:
-    """Return {(choice, number of keypoints asked for, 0 for no limit): (settings, masks)}.
+def jobs_of(sequence: Sequence, numbers: Iterable[int] = ()) -> dict[tuple[str, int], Job]:
+    """Return {(choice, number of keypoints asked for, 0 for no limit): a job}.
 
     numbers: NUMBERS if there are none.
     """
-    masks = LabelMasks(labels, sequence, CONTROL_WIDTH)
-    chosen: dict[tuple[str, int], tuple] = {
-        ("all", 0): (THESIS, None),
-        ("mask", 0): (THESIS, masks),
-        ("filled", 0): (replace(THESIS, detector=filled(FILL)), masks),
+    named = with_numbers(FEW, (0, *(numbers or NUMBERS)))
+    return {
+        (CALLED.get(name, name), number): Job(sequence.name, name, max_keypoints=number)
+        for name, number in named
     }
-    for number in numbers or NUMBERS:
-        few = replace(THESIS, max_keypoints=number)
-        drawn = FunctionMasks(partial(random_keypoints, sequence, number))
-        chosen |= {
-            ("strongest", number): (few, None),
-            ("random", number): (THESIS, drawn),
-            ("spread", number): (replace(THESIS, detector=spread(number)), None),
-            ("mask", number): (few, masks),
-        }
-    return chosen
+
+
+def choices(sequence: Sequence, labels: Path) -> dict[tuple[str, int], tuple]:
+    """Return {(choice, number): (settings, masks)} of NUMBERS, see `jobs_of`.
+
+    labels: a folder with one folder of label maps a sequence.
+    """
+    listed = jobs_of(sequence)
+    runs: dict[Job, Any] = runs_of(listed.values(), [sequence], [Source(labels)])
+    return {key: (runs[job].settings, runs[job].masks) for key, job in listed.items()}
 
 
 def run_few(
@@ -94,23 +88,18 @@ def run_few(
     repetitions: int = REPETITIONS,
     numbers: Iterable[int] = (),
 ) -> pd.DataFrame:
-    """Run all choices on sequences. Returns one row a run; finished sequences are not repeated.
+    """Run all choices on sequences. Returns one row a run; finished runs are not repeated.
 
     labels: a folder with one folder of label maps a sequence. folder: of the results. numbers: of
     keypoints, NUMBERS if there are none.
     """
-
-    def named(sequence: Sequence) -> dict[str, tuple]:
-        of_sequence = choices(sequence, labels, numbers).items()
-        return {f"{choice}-{number}": run for (choice, number), run in of_sequence}
-
-    table = run_choices(
-        named, sequences, labels, folder, __file__, ESTIMATORS, repetitions, processes
-    )
-    chosen = table["method"].str.rpartition("-")
+    sequences = list(sequences)
+    listed = [job for sequence in sequences for job in jobs_of(sequence, numbers).values()]
+    runs = runs_of(repeated(listed, ESTIMATORS, repetitions), sequences, [Source(labels)])
+    table = run_all(runs, folder, processes=processes).table
     return table.assign(
-        choice=chosen[0],
-        number=chosen[2].astype(int),
+        choice=table["method"].replace(CALLED),
+        number=table["max_keypoints"],
         keypoints=table["mean_keypoints"],
         failed=ratios.has_failed(table).astype(int),
     )[list(COLUMNS)]

@@ -1,5 +1,6 @@
 """Controls, ablations, the null distribution of the thesis's procedure, tracks and boundaries."""
 
+import inspect
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -8,10 +9,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from keypoint_study import comparisons, controls, jobs, methods, runner, worth
-from keypoint_study.jobs import first_jobs, runs_of
+from keypoint_study import ablations, comparisons, controls, jobs, methods, runner
+from keypoint_study.jobs import first_jobs, runs_of, worth_jobs
+from keypoint_study.methods import Asked
 from keypoint_study.sources import Source
-from thesis import ablations, section_4_2
+from thesis import section_4_2
+from thesis.ablations import boundaries
 from thesis_repro import masks
 from thesis_repro.data.cityscapes import ID
 from thesis_repro.data.kitti import Sequence
@@ -33,7 +36,7 @@ def made(sequence, small_labels):
     source = Source(small_labels)
     by_method = {"masked": folders.LabelMasks(small_labels / "00", sequence, WIDTH)}
     for method in set(methods.MASK_CONTROLS) - set(methods.EXPLORED):
-        _, by_method[method] = methods.METHODS[method].choose(sequence, source, WIDTH)
+        _, by_method[method] = methods.METHODS[method].choose(Asked(sequence, source))
     return by_method
 
 
@@ -82,14 +85,13 @@ def test_a_control_keeps_as_many_pixels_as_the_masks(made, name):
     assert shares == pytest.approx(expected, abs=0.01)
 
 
-def orb_on_masks(sequence, source, width):
-    return replace(THESIS, detector=keypoints.orb), source.masks(sequence, width)
+orb_on_masks = methods.found_by(keypoints.orb, methods.masked)
 
 
 def test_a_methods_own_settings_win_and_nothing_joins_a_study_unasked(
     sequence, small_labels, monkeypatch
 ):
-    own = methods.Method("ORB on masks", methods.CONTROL, orb_on_masks, every_study=False)
+    own = methods.Method("ORB on masks", methods.CONTROL, orb_on_masks, methods.IF_NAMED)
     monkeypatch.setitem(methods.METHODS, "orb-on-masks", own)
     monkeypatch.setattr(jobs, "MASK_CONTROLS", [*methods.MASK_CONTROLS, "orb-on-masks"])
     source, few = Source(small_labels), {"detector": keypoints.spread(200)}
@@ -98,17 +100,49 @@ def test_a_methods_own_settings_win_and_nothing_joins_a_study_unasked(
         runs = runs_of(planned, [sequence], [source], {"scale_gate": 0.5}, few)
         settings = {job.method: run.settings for job, run in runs.items()}
         assert set(named) == {"orb-on-masks"} & set(settings)
-        chosen = worth.choices_of(sequence, [source], WIDTH, (400,), True, few, named)
-        assert set(named) == {"orb-on-masks"} if ("ORB on masks", 400) in chosen else not named
+        listed = worth_jobs([sequence], [source], WIDTH, named=named)
+        chosen = runs_of(listed, [sequence], [source], masked_settings=few)
+        worth = {job.method: run.settings for job, run in chosen.items()}
+        assert set(named) == {"orb-on-masks"} & set(worth)
     assert settings["masked"].detector == keypoints.spread(200)
     assert settings["orb-on-masks"] == replace(THESIS, detector=keypoints.orb, scale_gate=0.5)
-    assert chosen["ORB on masks", 400][0].detector is keypoints.orb
-    assert chosen["mirrored mask", 400][0].detector == keypoints.spread(200)
+    assert worth["orb-on-masks"].detector is keypoints.orb
+    assert worth["mirrored"].detector == keypoints.spread(200)
+    assert worth["filled"].detector == keypoints.filled(methods.FILL, keypoints.spread(200))
+    assert worth["strongest"] == replace(THESIS, max_keypoints=400)
+
+
+@pytest.mark.parametrize("place, count", [(methods.ABLATIONS, 21), (methods.FEW, 6)])
+def test_ablations_and_few_keypoints_are_those_of_the_one_table(place, count):
+    assert len(methods.compared_in(place)) == count
+
+
+MADE_FROM = {  # another value of each argument
+    "dilation_width": 7,
+    "settings": masks.MaskSettings(margin=3),
+    "invert": True,
+    "make": controls.other_frame,
+    "given": ["other masks"],
+    "values": (3,),
+}
+
+
+@pytest.mark.parametrize("kind", [folders.LabelMasks, folders.MaskFolder, controls.MadeMasks])
+def test_each_argument_of_masks_is_in_their_record(sequence, small_labels, kind):
+    """A new argument fails here until it has another value above. Files are recorded apart."""
+    given = {"folder": small_labels / "00", "sequence": sequence, "dilation_width": 5}
+    given |= {"make": controls.mirrored, "given": ["masks"]}
+    taken = list(inspect.signature(kind).parameters)
+    plain = {name: given[name] for name in taken if name in given}
+    record = kind(**plain).record()
+    assert kind(**plain).record() == record
+    for name in set(taken) - {"folder", "sequence"}:
+        assert kind(**plain | {name: MADE_FROM[name]}).record() != record, name
 
 
 def explored(name, sequence, small_labels, index=3):
     """The frame and keypoints of a method that a study has to name, and its mask."""
-    settings, given = methods.METHODS[name].choose(sequence, Source(small_labels), WIDTH)
+    settings, given = methods.METHODS[name].choose(Asked(sequence, Source(small_labels)))
     frame, mask = sequence.frame(index), given[index]
     return frame, settings.detector(frame, settings, mask), mask
 
@@ -117,7 +151,9 @@ def explored(name, sequence, small_labels, index=3):
 def test_keypoints_are_spread_on_or_off_the_masks(name, on, sequence, small_labels, made):
     _, points, _ = explored(name, sequence, small_labels)
     columns, rows = points.astype(int).T
-    assert len(points) == methods.FEW and ((made["masked"][3][rows, columns] > 0) == on).all()
+    assert (
+        len(points) == methods.FEW_SPREAD and ((made["masked"][3][rows, columns] > 0) == on).all()
+    )
 
 
 def test_keypoints_beside_masks_are_near_them_and_none_is_taken_twice(sequence, small_labels):
@@ -210,7 +246,9 @@ def test_controls_leave_as_many_keypoints_as_masks_of_the_tested_width(
 
 def test_every_ablation_differs_from_its_reference_in_one_thing(small_world, small_labels):
     sequence = Sequence(small_world / "kitti", "00").subset(4)
-    runs = ablations.choices(sequence, small_labels)
+    listed = [jobs.Job("00", name) for name in methods.compared_in(methods.ABLATIONS)]
+    made = runs_of(listed, [sequence], [Source(small_labels)])
+    runs = {job.method: (run.settings, run.masks) for job, run in made.items()}
     settings, thesis_masks = runs["masked"]
     assert settings == THESIS
     expected = folders.LabelMasks(small_labels / "00", sequence, 10)
@@ -258,10 +296,10 @@ def test_the_half_that_the_camera_turns_into_is_kept(degrees, kept_half):
 def test_boundaries_between_close_ids_are_lost_and_between_distant_ids_found():
     label_map = np.full((320, 320), 7, np.uint8)
     label_map[:, 160:] = 8
-    near = ablations.boundaries(label_map, (188, 620))
+    near = boundaries(label_map, (188, 620))
     label_map[:, 160:] = 23
-    far = ablations.boundaries(label_map, (188, 620))
-    plain = ablations.boundaries(np.full_like(label_map, 20), (188, 620))
+    far = boundaries(label_map, (188, 620))
+    plain = boundaries(np.full_like(label_map, 20), (188, 620))
     assert near["lost"] == 100 == near["road/sidewalk"]
     assert far["lost"] == 0 and np.isnan(far["road/sidewalk"])
     assert far["invented"] > 0 == plain["invented"]

@@ -125,7 +125,7 @@ def test_a_failed_run_is_reported_and_stops_no_other_run(
         in printed
     )
     assert "sequence 00, masked-00-0: failed: dilation width 0" in printed
-    with pytest.raises(InputError, match="all 1 odometry runs failed; the first: dilation width 0"):
+    with pytest.raises(InputError, match="all 1 runs failed; the first: dilation width 0"):
         runner.run_all(
             runs_of(jobs[-1:], opened(small_world), [Source(small_labels)]),
             tmp_path / "none",
@@ -195,7 +195,7 @@ def test_first_jobs_are_complete_and_have_different_names(small_world, tiny_kitt
     assert rows.loc[rows["source"] == "ready", "dilation_width"].isna().all()
     net, ready_made = (set(rows.loc[rows["source"] == name, "method"]) for name in ("net", "ready"))
     # no list names them: what is in the table runs, unless it waits to be asked for
-    groups = {name: method.group for name, method in methods.METHODS.items() if method.every_study}
+    groups = {name: methods.METHODS[name].group for name in methods.compared_in(methods.STUDY)}
     of_labels = {name for name, group in groups.items() if group == methods.LABEL_MAPS}
     controls = {name for name, group in groups.items() if group == methods.CONTROL}
     assert net == {"masked", *of_labels, *controls} - {"fewer", "spread"}

@@ -14,22 +14,18 @@ pytestmark = pytest.mark.slow
 SHOW = """
 import json, sys
 from pathlib import Path
-from keypoint_study import jobs, runner, worth
+from keypoint_study import jobs, runner, worth_runs
 from keypoint_study.sources import Source
 from thesis_repro.data.kitti import Sequence
-from thesis_repro.running import provenance
 
-world, labels, out = map(Path, sys.argv[1:])
+world, labels = map(Path, sys.argv[1:])
 sequence, source = Sequence(world / "kitti", "00").subset(3), Source(labels)
-shown = {"runs": runner._versions(sequence)["code"]}
+shown = {"runs": runner._versions(runner.PATH, sequence)["code"]}
+shown["worth"] = runner._versions(worth_runs.WORTH, sequence)["code"]
 names = jobs.first_jobs([sequence], {"refined": (5,)}, tested=5)
+names.append(jobs.Job("00", "spread-anywhere", max_keypoints=100))
 for job, run in jobs.runs_of(names, [sequence], [source]).items():
-    shown[job.method] = runner.record_of(*run[1:], provenance.digest_of_files)["code"]
-worth.open_pool = None  # its record is written before the first call
-try:
-    worth.worths_of([sequence], [source], 5, out)
-except TypeError:
-    shown |= json.loads((out / "00/made-from.json").read_text())
+    shown[job.method] = runner.record_of(run)["code"]
 print(json.dumps(shown))
 """
 NEW = {
@@ -37,8 +33,7 @@ NEW = {
     "\n\nDETECTORS['mine'] = mine\n",
     "thesis_repro/data/mine.py": "LAYOUT = 'mine'\n\n\ndef is_mine(folder):\n    return False\n",
     "thesis_repro/data/ids/mine.csv": "1,road\n",
-    "keypoint_study/controls.py": "class Mine(Mirrored):\n    pass\n",
-    "keypoint_study/methods.py": "def mine(sequence, source, width):\n    return THESIS, None\n",
+    "thesis_repro/odometry/mine.py": "import cv2\n",
 }
 TABLES = {
     "thesis_repro/data/layout.py": (
@@ -47,7 +42,7 @@ TABLES = {
     ),
     "thesis_repro/odometry/keypoints.py": (("(orb, ", "(orb, mine, "),),
     "keypoint_study/methods.py": (
-        ("METHODS = {", "METHODS = {'mine': Method('mine', CONTROL, mine, every_study=False),"),
+        ("METHODS = {", "METHODS = {'mine': Method('mine', CONTROL, all_keypoints, IF_NAMED),"),
     ),
 }
 
@@ -61,14 +56,14 @@ def copy(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def before(copy, small_world, small_labels, tmp_path_factory):
-    return shown(copy, small_world, small_labels, tmp_path_factory.mktemp("out"))
+def before(copy, small_world, small_labels):
+    return shown(copy, small_world, small_labels)
 
 
-def shown(copy, world, labels, out):
+def shown(copy, world, labels):
     """All records, in a process of their own."""
     code = f"import sys; sys.path.insert(0, {str(copy)!r})\n{SHOW}"
-    command = [sys.executable, "-c", code, *map(str, (world, labels, out))]
+    command = [sys.executable, "-c", code, *map(str, (world, labels))]
     done = subprocess.run(command, cwd=copy, check=True, capture_output=True, text=True)
     return json.loads(done.stdout)
 
@@ -87,24 +82,27 @@ def test_a_new_entry_that_nobody_used_repeats_nothing(
     for file, text in NEW.items():
         place = changed / file
         old = place.read_text() if place.exists() else ""
-        # before the table that names it
-        first, table, last = old.partition(
-            "# {name: detector}" if "keypoints" in file else "class Method("
-        )
+        first, table, last = old.partition("# {name: detector}")  # before the table
         place.write_text(f"{first}{text.split('DETECTORS')[0]}\n\n{table}{last}")
-    after = shown(changed, small_world, small_labels, tmp_path / "out")
+    after = shown(changed, small_world, small_labels)
     assert after == before
 
 
 @pytest.mark.parametrize(
     "file, old, new, repeated",
     [
-        ("thesis_repro/odometry/loop.py", "MIN_MATCHES = 5", "MIN_MATCHES = 6", "runs code"),
-        ("thesis_repro/data/kitti_odometry.py", '"times.txt"', '"time.txt"', "runs code"),
-        ("thesis_repro/odometry/refined/fit.py", "eq=False", "eq=True", "masked code"),
-        ("thesis_repro/odometry/keypoints.py", "middle = int(", "middle = round(", "choices"),
-        ("keypoint_study/controls.py", "flip(self", "transpose(self", "mirrored choices"),
-        ("thesis_repro/masks/kinds.py", "2 * pixels + 1", "2 * pixels", "masked choices"),
+        ("thesis_repro/odometry/loop.py", "MIN_MATCHES = 5", "MIN_MATCHES = 6", "runs worth"),
+        ("thesis_repro/data/kitti_odometry.py", '"times.txt"', '"time.txt"', "runs worth"),
+        ("thesis_repro/odometry/refined/fit.py", "eq=False", "eq=True", "masked worth"),
+        (
+            "thesis_repro/odometry/keypoints.py",
+            "middle = int(",
+            "middle = round(",
+            "spread-anywhere",
+        ),
+        ("keypoint_study/controls.py", "flip(masks", "transpose(masks", "mirrored random-lines"),
+        ("thesis_repro/masks/kinds.py", "2 * pixels + 1", "2 * pixels", "masked mirrored"),
+        ("keypoint_study/worth.py", "SPLITS, SEED = 12", "SPLITS, SEED = 13", "worth"),
     ],
 )
 def test_a_change_of_what_was_used_repeats_it(
@@ -115,8 +113,8 @@ def test_a_change_of_what_was_used_repeats_it(
     text = (changed / file).read_text()
     assert old in text
     (changed / file).write_text(text.replace(old, new, 1))
-    after = shown(changed, small_world, small_labels, tmp_path / "out")
+    after = shown(changed, small_world, small_labels)
     different = {name for name in before if before[name] != after[name]}
     assert set(repeated.split()) <= different
-    if "mirrored" in repeated or file.endswith("keypoints.py"):  # of one class or function alone
+    if file.endswith(("keypoints.py", "worth.py")):  # of one class or measure alone
         assert different == set(repeated.split())

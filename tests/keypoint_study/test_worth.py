@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 from street import Street
 
-from keypoint_study import verdicts, worth
+from keypoint_study import verdicts, worth, worth_runs
 from thesis_repro import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.odometry import OPENCV, THESIS
@@ -118,7 +118,7 @@ def test_verdicts_need_both_splits_and_both_motions():
     near_one = random.normal(0, 0.03, (8, 4))
 
     def verdict(logarithms):
-        (row,) = worth.typical_worths(worths(logarithms)).itertuples()
+        (row,) = worth_runs.typical_worths(worths(logarithms)).itertuples()
         return row.verdict
 
     assert verdict(near_one) == verdicts.AS_MUCH
@@ -128,6 +128,15 @@ def test_verdicts_need_both_splits_and_both_motions():
         less_but_one = near_one - 0.7 * (np.arange(4) != column)
         assert verdict(less_but_one) == verdicts.NO_CLEAR_DIFFERENCE
     assert verdict(near_one[:5] - 0.7) == verdicts.TOO_FEW
+    # the last two are new, and lie on the other side in one motion by fields
+    more = np.concatenate([near_one + 0.7] * 3)
+    more[-2:, 0] *= -0.1
+    told = [worth_runs.typical_worths(worths(more), new) for new in ([], ["22"], ["22", "23"])]
+    assert [each["verdict"][0] for each in told] == [
+        verdicts.MORE,
+        verdicts.MORE,
+        verdicts.NO_CLEAR_DIFFERENCE,
+    ]
 
 
 @pytest.mark.parametrize("streets", [8, 11])
@@ -140,7 +149,7 @@ def test_error_rates_of_the_verdicts_by_chance(streets):
         spread = spread + random.normal(0, 0.3 * np.sqrt(0.5), (200, streets, 4))
         names = [f"{motion}_{split}" for split in worth.SPLIT for motion in worth.MOTIONS]
         studies = [pd.DataFrame(each + centre, columns=names) for each in spread]
-        return [worth._verdict(dict(of_study.items())) for of_study in studies]
+        return [worth_runs._verdict(dict(of_study.items())) for of_study in studies]
 
     wrong = [each in (verdicts.LESS, verdicts.MORE) for each in words(0)]
     assert np.mean(wrong) < 0.03
@@ -204,7 +213,7 @@ def test_one_choice_is_divided_by_another():
         for choice, worth_of_choice in (("masks", 0.5), ("beside", 2.0))
     ]
     columns = ["sequence", "choice", "number", "split", "rotation", "direction"]
-    divided = worth.over(pd.DataFrame(rows, columns=columns), "masks", "beside")
+    divided = worth_runs.over(pd.DataFrame(rows, columns=columns), "masks", "beside")
     assert list(divided["rotation"]) == list(divided["direction"]) == [0.25, 0.25]
     assert list(divided["sequence"]) == ["00", "01"] and divided["choice"].nunique() == 1
 

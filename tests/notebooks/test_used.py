@@ -38,7 +38,6 @@ def record(root, run):
             [
                 ("notebooks/thesis/book.py", "return", "return 1 and "),
                 ("thesis_repro/odometry/new_detector.py", "", "import cv2"),  # that nothing uses
-                ("thesis_repro/odometry/loop.py", "\n\nclass", "\n\n# a comment\nclass"),
                 ("notebooks/06_keypoint_masks-Copy1.ipynb", "", "{}"),
             ],
             "",

@@ -1,26 +1,30 @@
 """Digests of code: what was used is in, what was not is out, in a small package of its own."""
 
+import ast
+import inspect
 import subprocess
 import sys
+import textwrap
 from functools import partial
 
 import pytest
 
+from thesis_repro.odometry import estimators, keypoints
+from thesis_repro.running import code_used
+
 FILES = {
     "thesis/__init__.py": "",
-    "thesis/table.py": "from thesis import one, two\n\nTABLE = {'one': one.find, 'two': two.find}\n",
-    "thesis/one.py": "from thesis.helpers import halved\n\nLIMIT = 3\nUNUSED = 1\n\n\n"
-    "def find(frame):\n    from thesis import late\n    return halved(frame) + LIMIT + late.added()\n",
+    "thesis/one.py": "from thesis import helpers\n\n\ndef find(frame):\n"
+    "    from thesis.late import added\n    return helpers.halved(frame) + added()\n",
     "thesis/two.py": "def find(frame):\n    return 0\n",
-    "thesis/helpers.py": "import numpy as np\n\nif np:\n    HALF = 2\n\n\n"
-    "def halved(value):\n    return value // HALF\n\n\ndef other():\n    return 0\n",
-    "thesis/late.py": "SUMS = {}\nSUMS['a'] = 1\n\n\ndef added():\n    return SUMS['a']\n",
+    "thesis/helpers.py": "import numpy as np\n\n\ndef halved(value):\n    return value // 2\n",
+    "thesis/late.py": "SUM = 1\n\n\ndef added():\n    return SUM\n",
 }
 PRINT = """
 from thesis_repro.running.code_used import digest_of_code
-from thesis import one, table
+from thesis import one
 {}
-print(digest_of_code({}, without=("thesis.table.TABLE",)))
+print(digest_of_code({}))
 """
 
 
@@ -41,17 +45,10 @@ def digest(root, used="one.find", before=""):
 @pytest.mark.parametrize(
     "file, old, new, changes",
     [
-        ("one", "+ LIMIT", "- LIMIT", True),
-        ("one", "LIMIT = 3", "LIMIT = 4", True),  # a value that it uses
-        ("helpers", "// HALF", "/ HALF", True),  # a function of another module
-        ("helpers", "HALF = 2", "HALF = 4", True),  # within a condition
-        ("late", "return SUMS", "return 1 + SUMS", True),  # imported where it is used
-        ("late", "SUMS['a'] = 1", "SUMS['a'] = 2", True),  # changes what it uses
-        ("one", "LIMIT = 3", "print('loaded')\nLIMIT = 3", True),  # done at the import
-        ("one", "UNUSED = 1", "UNUSED = 2", False),
-        ("helpers", "return 0", "return 1", False),
+        ("one", "halved(frame) +", "halved(frame) -", True),
+        ("helpers", "// 2", "/ 2", True),  # a module that it imports
+        ("late", "SUM = 1", "SUM = 2", True),  # imported where it is used
         ("two", "return 0", "return 1", False),
-        ("one", "LIMIT = 3", "# a comment\nLIMIT = 3", False),
     ],
 )
 def test_what_was_used_changes_the_digest_and_nothing_else(tmp_path, file, old, new, changes):
@@ -73,18 +70,24 @@ def test_an_object_is_used_with_what_it_holds(tmp_path):
     ]
     before = [digest(tmp_path, *kind) for kind in kinds]
     path = tmp_path / "thesis/helpers.py"
-    path.write_text(path.read_text().replace("// HALF", "/ HALF"))
+    path.write_text(path.read_text().replace("// 2", "/ 2"))
     assert all(digest(tmp_path, *kind) != one for kind, one in zip(kinds, before, strict=True))
 
 
-def test_entries_of_a_table_that_is_left_out_count_only_if_they_are_given(tmp_path):
-    uses = "def use(name):\n    return table.TABLE[name]\n"
-    script = repr(f"from thesis import table\n{uses}use('one')")
-    first = [digest(tmp_path, used) for used in (script, f"{script}, one.find")]
-    path = tmp_path / "thesis/two.py"
-    path.write_text("def find(frame):\n    return 7\n")
-    assert [digest(tmp_path, used) for used in (script, f"{script}, one.find")] == first
-    path = tmp_path / "thesis/one.py"
-    path.write_text(path.read_text().replace("LIMIT = 3", "LIMIT = 4"))
-    again = [digest(tmp_path, used) for used in (script, f"{script}, one.find")]
-    assert again[0] == first[0] and again[1] != first[1]
+def test_entries_of_tables_stand_for_themselves():
+    """They use no other name of their module, so their own text tells all of it."""
+    for module, entries in (
+        (keypoints, keypoints.DETECTORS.values()),
+        (estimators, [entry.make for entry in estimators.ESTIMATORS.values() if entry.make]),
+    ):
+        assert module.__name__ in code_used.TABLES
+        here = {name for name, each in vars(module).items() if is_of(each, module.__name__)}
+        for entry in entries:
+            tree = ast.parse(textwrap.dedent(inspect.getsource(entry)))
+            used = {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
+            assert not used & here - {entry.__name__}, entry
+
+
+def is_of(each, module):
+    """Whether a value was made in a module: not one that it imports."""
+    return getattr(each, "__module__", module) == module and not inspect.ismodule(each)

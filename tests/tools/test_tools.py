@@ -11,7 +11,7 @@ from executing import run_of
 import bench
 import evidence
 import train_shipped
-from keypoint_study import jobs, runner, worth
+from keypoint_study import jobs, runner, worth, worth_runs
 from keypoint_study.sources import Source
 from thesis.settings import read_settings
 from thesis_repro.data.kitti import Sequence
@@ -57,8 +57,8 @@ def test_evidence_keeps_what_shows_no_frame(executed, tmp_path, monkeypatch):
     shutil.copytree(executed, tmp_path / "run", symlinks=True)
     settings = read_settings(run_of(tmp_path / "run"))
     out = tmp_path / "out"
-    monkeypatch.setattr(evidence.worth, "MAX_STEPS", 1)
-    monkeypatch.setattr(evidence.worth, "SPLITS", 1)
+    monkeypatch.setattr(worth, "MAX_STEPS", 1)
+    monkeypatch.setattr(worth, "SPLITS", 1)
     monkeypatch.setattr(evidence.few_keypoints, "TIMED_RUNS", 1)
     monkeypatch.setattr(evidence.few_keypoints, "REPETITIONS", 1)
     monkeypatch.setattr(evidence.few_keypoints, "NUMBERS", (50, 200))
@@ -98,9 +98,14 @@ def test_a_street_gives_the_evidence_in_git(kitti_real, tmp_path, street):
         for repetition in (0, 1)
     ]
     runs = runner.run_all(jobs.runs_of(planned, [sequence], [source]), tmp_path / "runs").table
-    chosen = worth.choices_of(sequence, [source], 10)
-    asked = {key: chosen[key] for key in chosen if key[0] in ("random keypoints", "masks")}
-    for name, made in ("runs", runs), ("worth_runs", worth.worth_of(sequence, asked)):
+    asked = [
+        job
+        for job in jobs.worth_jobs([sequence], [source], 10)
+        if job.method in ("drawn", "masked")
+    ]
+    measured = jobs.runs_of(asked, [sequence], [source])
+    worths = runner.run_all(measured, tmp_path / "worth", worth_runs.WORTH).table
+    for name, made in ("runs", runs), ("worth_runs", worths):
         text = made.to_csv(index=False, lineterminator="\n", float_format="%.6g")
         whole = (evidence.FOLDER / f"{name}.csv").read_text(encoding="utf-8").splitlines()
         head, *rows = text.splitlines()

@@ -71,13 +71,6 @@ class LabelMasks:
         table = label_ids.record(self.settings.ids)
         return ["label maps", self.dilation_width, str(self.settings), table]
 
-    def check_files(self, known: set[Any]) -> None:
-        """Raise InputError if a label map cannot be read. known: files that can, added to."""
-        ids = self.settings.ids
-        for path in [path for path in self.paths if (path, ids) not in known]:
-            label_ids.read(path, ids)
-            known.add((path, ids))
-
 
 @lru_cache(maxsize=2)  # masks of several settings, and controls, share label maps
 def _read_once(path: Path, ids: str, changed: int, size: int) -> np.ndarray:
@@ -138,12 +131,6 @@ class MaskFolder:
     def record(self) -> list[Any]:
         """Return what the masks depend on beside files."""
         return ["masks", self.invert]
-
-    def check_files(self, known: set[Any]) -> None:
-        """Raise InputError if a mask cannot be read. known: files that can, added to."""
-        for path in [path for path in self.paths if path not in known]:
-            read_mask(path, self.size, self.invert)
-            known.add(path)
 
 
 def read_mask(

@@ -5,6 +5,7 @@ MaskSettings chooses among them; its defaults are the thesis's.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cache
 from numbers import Integral
 from typing import NamedTuple
 
@@ -142,7 +143,7 @@ def keypoint_mask(
     label_map = _checked(label_map)
     if settings.has_width:
         check_width(dilation_width, size)
-    if settings == replace(THESIS_MASKS, ids=settings.ids):
+    if _is_thesis(settings):
         assert dilation_width is not None  # checked above
         return thesis_mask(label_map, size, dilation_width)
     mask = KINDS[settings.keep].make(label_map, size, dilation_width, settings)
@@ -153,6 +154,12 @@ def keypoint_mask(
         mask[first] = mask[last] = 0
         mask[:, first] = mask[:, last] = 0
     return mask
+
+
+@cache  # a replaced copy is checked, which takes as long as a small mask
+def _is_thesis(settings: MaskSettings) -> bool:
+    """Whether masks are the thesis's, of any ids."""
+    return settings == replace(THESIS_MASKS, ids=settings.ids)
 
 
 @remembered

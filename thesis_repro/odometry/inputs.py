@@ -163,7 +163,7 @@ _latest: tuple[np.ndarray, np.ndarray] | None = None  # a frame and its strength
 
 
 def _corner_strength(frame: np.ndarray) -> np.ndarray:
-    """Corner strength of each pixel. That of the latest frame is kept, for all runs that share it."""
+    """Corner strength of each pixel. That of the latest frame is kept, for runs that share it."""
     global _latest
     latest = _latest  # another thread may change it
     if latest is None or latest[0] is not frame:

@@ -1,6 +1,7 @@
 """Detectors beside the thesis's, for settings: OdometrySettings(detector=spread(200)).
 
-A new one is a function or class here and its name in DETECTORS.
+A new one is a function or class here and its name in DETECTORS. It uses no other name of this
+module: it stands for itself in records of runs (`running.code_used`).
 
 A detector is a function of a frame (height, width), settings and a mask, (height, width) or None,
 which allows keypoints where it is not 0. It returns (N, 2) float32 pixels, strongest first. Those
@@ -11,13 +12,12 @@ which most runs do without.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import cv2
 import numpy as np
 
 from thesis_repro.odometry.settings import THESIS, OdometrySettings, check_number
-
-FIELDS = (5, 16)  # rows and columns into which a frame is divided to fill a mask
 
 
 def orb(
@@ -73,6 +73,8 @@ class filled:
     inside the mask; None: the thesis's.
     """
 
+    FIELDS: ClassVar = (5, 16)  # rows and columns into which a frame is divided
+
     number: int
     detector: Callable | None = None
 
@@ -93,9 +95,9 @@ class filled:
             return points
         everywhere = corners.detect(frame, replace(settings, max_keypoints=0))
         chosen = list(points)
-        fields_of_points = _fields(points, frame.shape)
-        fields_of_others = _fields(everywhere, frame.shape)
-        for field in range(FIELDS[0] * FIELDS[1]):
+        fields_of_points = self._fields(points, frame.shape)
+        fields_of_others = self._fields(everywhere, frame.shape)
+        for field in range(self.FIELDS[0] * self.FIELDS[1]):
             taken = list(points[fields_of_points == field])
             for candidate in everywhere[fields_of_others == field]:
                 if len(taken) >= self.number:
@@ -105,6 +107,12 @@ class filled:
                     taken.append(candidate)
                     chosen.append(candidate)
         return np.reshape(chosen, (-1, 2)).astype(np.float32)
+
+    def _fields(self, points: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
+        """Number of the field in which each of N points (N, 2) lies, (N,)."""
+        down, across = self.FIELDS
+        columns, rows = (points // (size[1] / across, size[0] / down)).astype(int).T
+        return rows * across + columns
 
 
 def filtered(
@@ -118,12 +126,6 @@ def filtered(
         return points
     columns, rows = np.rint(points).astype(int).T
     return points[mask[rows, columns] > 0]
-
-
-def _fields(points: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
-    """Number of the field in which each of N points (N, 2) lies, (N,)."""
-    columns, rows = (points // (size[1] / FIELDS[1], size[0] / FIELDS[0])).astype(int).T
-    return rows * FIELDS[1] + columns
 
 
 # {name: detector}. Each is thesis_repro.NAME and, unless it needs a number, --detector NAME, which

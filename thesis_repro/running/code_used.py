@@ -1,95 +1,78 @@
-"""A digest of the code that made a result: the definitions that it used, and all that these use.
+"""A digest of the code that made a result: the modules that it used, and all that these import.
 
-A definition is a statement of a module: a function, a class or a value. From those that made a
-result, names are followed through the modules of PACKAGES. So an entry that nothing leads to
-changes no digest, and neither does a comment, but a definition that was used does.
+Editing a module, even a comment, repeats what used it or imports it, directly or not. A module that
+nobody imports repeats nothing. Nor does a new entry of a table: the modules of TABLES count for
+nobody, and each entry stands for itself, by its own text, where it was used.
 Other packages are told by their versions (`provenance.versions`).
 """
 
 import ast
 import hashlib
+import inspect
 import linecache
-from collections import defaultdict
-from collections.abc import Collection, Iterable, Iterator
+import textwrap
 from functools import cache, partial
 from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import Any
 
 PACKAGES = ("thesis_repro", "keypoint_study", "opencv_exact", "street_world", "thesis")
-WHOLE = "*"  # in place of a name: all that a module defines and imports
+# of detectors, estimators and layouts. A function or class there uses no other one of its module.
+TABLES = (
+    "thesis_repro.odometry.keypoints",
+    "thesis_repro.odometry.estimators",
+    "thesis_repro.data.layout",
+)
 
 
-class Place(NamedTuple):
-    """A name in a module; without a name, what the module does when it is imported."""
-
-    module: str
-    name: str = ""
-
-
-class Code(NamedTuple):
-    """A module: the modules that it loads, and its names, imported or defined."""
-
-    loads: list[Place]
-    imports: dict[str, Place]
-    definitions: dict[str, list[ast.AST]]
-
-    def nodes(self) -> list[ast.AST]:
-        """Return all its statements but imports."""
-        return [node for nodes in self.definitions.values() for node in nodes]
-
-
-def digest_of_code(*used: Any, without: Collection[str] = ()) -> str:
+def digest_of_code(*used: Any) -> str:
     """Return a digest of the code of what was used.
 
-    used: functions, classes, modules, and objects with what they hold; a text is that of a script.
-    without: definitions that are not followed, "module.name": tables whose entries are in `used`.
+    used: modules, functions, classes, and objects with what they hold; a text is that of a script.
     """
     texts: set[str] = set()
-    known: dict[Any, Any] = {}  # keeps what is known by its identity
+    modules: set[str] = set()
+    known: dict[int, Any] = {}  # keeps what is known by its identity
     waiting = list(used)
     while waiting:
         each = waiting.pop()
-        key = each if isinstance(each, Place) else id(each)
-        if key in known or (isinstance(each, Place) and ".".join(each) in without):
+        if id(each) in known:
             continue
-        known[key] = each
-        text, more = _of_place(each) if isinstance(each, Place) else _of_object(each)
-        texts.add(text)
-        waiting += more
+        known[id(each)] = each
+        waiting += _held(each)
+        module = each.__name__ if isinstance(each, ModuleType) else _definition(each).__module__
+        if isinstance(each, str) or module in TABLES or not _path(module):
+            text = each if isinstance(each, str) else _text_of(_definition(each))
+            texts.add(text)
+            modules.update(*map(_with_imports, _imported(text)))
+        else:
+            modules |= _with_imports(module)
+    texts |= {_text(module) for module in modules}
     return hashlib.sha256("\0".join(sorted(texts)).encode()).hexdigest()[:12]
 
 
-def _of_object(each: Any) -> tuple[str, list[Any]]:
-    """Return the text of an object's code, if PACKAGES have it not, and what the object uses."""
+def _definition(each: Any) -> Any:
+    """Return the function or class of an object."""
+    return each if hasattr(each, "__qualname__") else type(each)
+
+
+def _held(each: Any) -> list[Any]:
+    """Return the functions and objects of PACKAGES that an object holds."""
+    held = [cell.cell_contents for cell in getattr(each, "__closure__", None) or ()]
     if isinstance(each, partial):
-        return "", [each.func, *_held([*each.args, *each.keywords.values()])]
-    if isinstance(each, ModuleType):
-        return "", [Place(each.__name__, WHOLE)]
-    if isinstance(each, str):
-        script = _code(each)
-        return each, [*script.loads, *_uses(Place(""), script.nodes(), script)]
-    name = getattr(each, "__qualname__", "").split(".")[0]
-    if not name:
-        return "", [type(each), *_held(vars(each).values() if hasattr(each, "__dict__") else ())]
-    cells = getattr(each, "__closure__", None) or ()
-    held = [cell.cell_contents for cell in cells]
+        held = [each.func, *each.args, *each.keywords.values()]
+    elif not hasattr(each, "__qualname__") and not isinstance(each, ModuleType):
+        held = list(getattr(each, "__dict__", {}).values())
     held += [getattr(each, "__self__", None), *getattr(each, "__bases__", ())]
-    module = str(getattr(each, "__module__", ""))
-    if _path(module):
-        return "", [Place(module, name), *_held(held)]
-    return _text_around(each), _held(held)
+    return [part for part in held if callable(part) or _path(type(part).__module__)]
 
 
-def _held(parts: Iterable[Any]) -> list[Any]:
-    """Return the parts of an object that can have code."""
-    return [part for part in parts if callable(part) or _path(type(part).__module__)]
-
-
-def _text_around(each: Any) -> str:
-    """Return the text of the file, or of the notebook's cell, of a function or a class."""
-    parts = [each, *getattr(each, "__dict__", {}).values()]
+def _text_of(definition: Any) -> str:
+    """Return the text of an entry of TABLES, or of the file or notebook's cell around code."""
+    if definition.__module__ in TABLES:
+        return textwrap.dedent(inspect.getsource(definition))
+    parts = [definition, *getattr(definition, "__dict__", {}).values()]
     for code in [part.__code__ for part in parts if hasattr(part, "__code__")]:
         linecache.checkcache(code.co_filename)
         return "".join(linecache.getlines(code.co_filename))
@@ -97,22 +80,36 @@ def _text_around(each: Any) -> str:
 
 
 @cache
-def _of_place(place: Place) -> tuple[str, list[Place]]:
-    """Return the text of a definition, and the places that it leads to."""
-    module, name = place
+def _with_imports(module: str) -> frozenset[str]:
+    """Return the names of a module of PACKAGES and of those that it imports, directly or not."""
+    found: set[str] = set()
+    waiting = [module]
+    while waiting:
+        name = waiting.pop()
+        if name not in found and name not in TABLES and _path(name):
+            found.add(name)
+            waiting += _imported(_text(name))
+    return frozenset(found)
+
+
+@cache
+def _imported(text: str) -> list[str]:
+    """Return the names of the modules that a text imports, at its beginning or in a function."""
+    names: list[str] = []
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Import):
+            names += [each.name for each in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            module = node.module or ""
+            inner = [f"{module}.{each.name}" for each in node.names]
+            names += [name if _path(name) else module for name in inner]
+    return names
+
+
+@cache
+def _text(module: str) -> str:
     path = _path(module)
-    if path is None:
-        return "", []
-    code = _code(path.read_text(encoding="utf-8"))
-    if name in code.imports:
-        return "", [Place(module), code.imports[name]]
-    if name in code.definitions or name in ("", "__file__"):  # a path needs no definition
-        nodes = code.definitions.get(name, [])
-        more = [Place(module)] if name else [Place(module.rpartition(".")[0]), *code.loads]
-    else:  # all of it, or a name that is made as the module runs
-        nodes = code.nodes()
-        more = [Place(module), *code.imports.values()]
-    return "\n".join(map(ast.unparse, nodes)), [*more, *_uses(place, nodes, code)]
+    return path.read_text(encoding="utf-8") if path else ""
 
 
 @cache
@@ -124,76 +121,3 @@ def _path(module: str) -> Path | None:
         return None
     path = Path(spec.origin).parent.joinpath(*parts)
     return next(filter(Path.is_file, (path / "__init__.py", path.with_suffix(".py"))), None)
-
-
-@cache
-def _code(text: str) -> Code:
-    """Return the names of a module with a text."""
-    body = ast.parse(text).body
-    loads = [Place(place.module) for node in body for place in _imported(node).values()]
-    code = Code(loads, {}, defaultdict(list))
-    for node in _statements(body):
-        code.imports.update(_imported(node))
-        for name in _defined(node):
-            code.definitions[name].append(node)
-    return code
-
-
-def _statements(nodes: Iterable[ast.AST]) -> Iterator[ast.AST]:
-    """Yield statements, and those of conditions in place of these."""
-    for node in nodes:
-        if isinstance(node, ast.If | ast.Try | ast.ExceptHandler):
-            yield from _statements(ast.iter_child_nodes(node))
-        else:
-            yield node
-
-
-def _defined(node: ast.AST) -> list[str]:
-    """Return the names that a statement defines; "" for one that does something else."""
-    if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
-        return [node.name]
-    is_docstring = isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
-    if is_docstring or isinstance(node, ast.Import | ast.ImportFrom):
-        return []
-    if not isinstance(node, ast.Assign | ast.AnnAssign | ast.AugAssign):
-        return [""]
-    targets = node.targets if isinstance(node, ast.Assign) else [node.target]
-    parts = [part for target in targets for part in ast.walk(target) if isinstance(part, ast.Name)]
-    return [part.id for part in parts if isinstance(part.ctx, ast.Store)] or [""]
-
-
-def _imported(node: ast.AST) -> dict[str, Place]:
-    """Return what an import gives names to: {name: place}."""
-    if isinstance(node, ast.ImportFrom):
-        module = node.module or ""
-        return {each.asname or each.name: _place(module, each.name) for each in node.names}
-    if isinstance(node, ast.Import):
-        names = {each.asname or each.name.split(".")[0]: each for each in node.names}
-        return {name: Place(each.name if each.asname else name) for name, each in names.items()}
-    return {}
-
-
-def _place(module: str, name: str) -> Place:
-    """Return the place of a name in a module, which may be a module itself."""
-    inner = f"{module}.{name}"
-    return Place(inner) if _path(inner) else Place(module, name)
-
-
-def _uses(place: Place, nodes: Iterable[ast.AST], code: Code) -> list[Place]:
-    """Return the places that the names in statements of a module lead to."""
-    parts = [part for node in nodes for part in ast.walk(node)]
-    inner = [item for part in parts for item in _imported(part).items()]
-    imports = code.imports | dict(inner)
-    attributes = {id(part.value): part.attr for part in parts if isinstance(part, ast.Attribute)}
-    places = [Place(imported.module) for _, imported in inner]
-    for part in parts:
-        if not isinstance(part, ast.Name):
-            continue
-        if part.id in code.definitions:
-            places.append(Place(place.module, part.id))
-        if part.id in imports:
-            used = imports[part.id]
-            if not used.name:  # a module, of which an attribute is used, or all
-                used = _place(used.module, attributes.get(id(part), WHOLE))
-            places.append(used if used.name else Place(used.module, WHOLE))
-    return places
