@@ -19,7 +19,9 @@ def compiled(function: Callable, **options: Any) -> Callable:
     Numba compiles a function anew for each combination of types and memory layouts. So callers pass
     C-contiguous arrays of one type.
     """
-    options = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True, **options}
+    # said, fastmath is not inherited from the function that calls this one
+    usual = {"nogil": True, "error_model": "numpy", "fastmath": False, "no_cfunc_wrapper": True}
+    options = {**usual, **options}
     try:
         dispatcher = numba.njit(cache=True, **options)(function)
     except RuntimeError:  # Numba finds no folder that it may write its cache to

@@ -119,26 +119,19 @@ def track(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Track points (N, 2) as `loop.track` does, in less time.
 
-    Points are sorted by row, so that the pixels of neighbouring points are still in the processor's
-    cache. The matching error is not computed, because nothing uses it. Computing it, OpenCV also
-    rejects points whose window leaves the frame; this function does that itself.
+    The matching error is not computed, because nothing uses it. Computing it, OpenCV also rejects
+    points whose window leaves the frame; this function does that itself.
     """
     window = settings.window
-    order = np.argsort(points[:, 1])
-    tracked_in_order, status, _ = cv2.calcOpticalFlowPyrLK(
+    tracked, status, _ = opencv_exact.track(
         previous,
         current,
-        points[order],
-        None,
+        points,
         winSize=(window, window),
         maxLevel=settings.levels,
         criteria=TERMINATION,
         flags=cv2.OPTFLOW_LK_GET_MIN_EIGENVALS,
     )
-    tracked = np.empty_like(points)
-    tracked[order] = tracked_in_order
-    was_found = np.empty(len(points), bool)
-    was_found[order] = status.ravel() == 1
     window_corner = tracked - (window - 1) / 2  # upper left
     touches_frame = (window_corner >= -window) & (window_corner < current.shape[::-1])
-    return tracked, was_found & touches_frame.all(axis=1)
+    return tracked, (status.ravel() == 1) & touches_frame.all(axis=1)
