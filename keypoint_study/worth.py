@@ -226,7 +226,9 @@ def refined_motion(tracks: Tracks, indices: np.ndarray) -> RefinedMotion | None:
     if len(indices) < MIN_MATCHES:
         return None
     current, previous = tracks.current[indices], tracks.previous[indices]
-    matrix, inliers = opencv_exact.find_essential_matrix(current, previous, tracks.threshold)
+    matrix, inliers = opencv_exact.find_essential_matrix(
+        current, previous, threshold=tracks.threshold
+    )
     if matrix is None or inliers is None or matrix.shape != (3, 3) or not np.isfinite(matrix).all():
         return None
     matches = Matches(current, previous, tracks.threshold, inliers.ravel() > 0)

@@ -4,18 +4,21 @@ import cv2
 import numpy as np
 
 from opencv_exact.compiling import compiled, inlined
+from opencv_exact.ransac import as_pairs
 
 MAX_DEPTH = 50.0  # in lengths of the translation; as in cv2.recoverPose, farther points do not vote
 # for homogeneous points of unit norm; points nearer to a limit are left to OpenCV
 LIMIT_MARGIN = 1e-7
+FORWARD, BACKWARD, DOUBTFUL = 1, 2, 3  # how a point votes: for t, for -t, or too close to a limit
 
 
 def recover_pose(
-    matrix: np.ndarray, current: np.ndarray, previous: np.ndarray
-) -> tuple[int, np.ndarray, np.ndarray]:
-    """Motion from an essential matrix: (votes, R, t), with the bits of cv2.recoverPose.
+    E: np.ndarray, points1: np.ndarray, points2: np.ndarray
+) -> tuple[int, np.ndarray, np.ndarray, np.ndarray]:
+    """Motion from an essential matrix: (votes, R, t, mask), with the bits of cv2.recoverPose.
 
-    That is cv2.recoverPose(matrix, current, previous).
+    That is cv2.recoverPose(E, points1, points2). points1, points2: normalised coordinates (N, 2) or
+    (N, 1, 2). t: (3, 1). mask: (N, 1) uint8, 255 for points that vote for the motion.
 
     An essential matrix allows four motions. A point votes for a motion if it lies in front of both
     cameras and nearer than MAX_DEPTH. The motion with most votes wins. OpenCV triangulates every
@@ -23,7 +26,8 @@ def recover_pose(
     decide how nearly all points vote, for both signs of the translation at once. OpenCV's
     triangulation decides only about points close to a limit.
     """
-    first, second, translation = cv2.decomposeEssentialMat(matrix)
+    current, previous = as_pairs(points1), as_pairs(points2)
+    first, second, translation = cv2.decomposeEssentialMat(E)
     motions = [
         (first, translation),
         (second, translation),
@@ -31,29 +35,34 @@ def recover_pose(
         (second, -translation),
     ]
     votes = np.zeros(4, np.int64)
-    doubtful = [np.empty(0, np.int64), np.empty(0, np.int64)]  # points, for each rotation
+    sides = [np.empty(0, np.int8), np.empty(0, np.int8)]  # of the points, for each rotation
     # A car's rotation is the smaller one. Its votes are counted first; the other's only while it
     # can still win.
     smaller = int(np.trace(first) < np.trace(second))
     for index in (smaller, 1 - smaller):
         rotation, _ = motions[index]
-        votes[index], votes[index + 2], doubtful[index] = _count_in_front(
+        votes[index], votes[index + 2], sides[index] = _count_in_front(
             current, previous, rotation, translation.ravel(), votes.max()
         )
     most_certain = votes.max()
+    masks = [sides[index % 2] == (FORWARD, BACKWARD)[index // 2] for index in range(4)]
     for index, motion in enumerate(motions):
-        points = doubtful[index % 2]
-        if len(points) and votes[index] + len(points) >= most_certain:  # this motion can still win
-            votes[index] += _triangulate_and_count(current[points], previous[points], *motion)
+        doubtful = np.flatnonzero(sides[index % 2] == DOUBTFUL)
+        if len(doubtful) and votes[index] + len(doubtful) >= most_certain:  # it can still win
+            masks[index][doubtful] = _triangulate_and_vote(
+                current[doubtful], previous[doubtful], *motion
+            )
+            votes[index] = masks[index].sum()
     best = int(np.argmax(votes))  # the first of equal numbers, as in OpenCV
     rotation, translation = motions[best]
-    return int(votes[best]), rotation, translation.ravel()
+    mask = np.where(masks[best], np.uint8(255), np.uint8(0)).reshape(-1, 1)
+    return int(votes[best]), rotation, translation, mask
 
 
-def _triangulate_and_count(
+def _triangulate_and_vote(
     current: np.ndarray, previous: np.ndarray, rotation: np.ndarray, translation: np.ndarray
-) -> int:
-    """Number of votes for a motion, counted as OpenCV does."""
+) -> np.ndarray:
+    """Whether points vote for a motion, (N,) booleans, as OpenCV decides it."""
     projection = np.hstack([rotation, translation])
     points = cv2.triangulatePoints(np.eye(3, 4), projection, current.T.copy(), previous.T.copy())
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -61,18 +70,17 @@ def _triangulate_and_count(
         points = points / points[3]
         depth = projection[2] @ points
         votes &= points[2] < MAX_DEPTH
-        votes &= (depth > 0) & (depth < MAX_DEPTH)
-    return int(votes.sum())
+        return votes & (depth > 0) & (depth < MAX_DEPTH)
 
 
 @compiled
 def _count_in_front(current, previous, rotation, t, least):
-    """Votes for (rotation, t) and (rotation, -t), and the points that are too close to a limit.
+    """Votes for (rotation, t) and (rotation, -t), and how each point votes, (N,) int8.
 
     Stops as soon as neither motion can reach `least` votes.
     """
     forward, backward, doubts = 0, 0, 0
-    doubtful = np.empty(len(current), np.int64)
+    sides = np.zeros(len(current), np.int8)
     a = np.zeros((4, 4))
     b = np.empty((4, 4))
     for index in range(len(current)):
@@ -110,13 +118,15 @@ def _count_in_front(current, previous, rotation, t, least):
             or abs(abs(z) - farthest) < margin
             or abs(abs(depth) - farthest) < margin
         ):
-            doubtful[doubts] = index
+            sides[index] = DOUBTFUL
             doubts += 1
         elif 0 < z < farthest and 0 < depth < farthest:
+            sides[index] = FORWARD
             forward += 1
         elif 0 < -z < farthest and 0 < -depth < farthest:
+            sides[index] = BACKWARD
             backward += 1  # the opposite t changes the signs of w and of both depths
-    return forward, backward, doubtful[:doubts]
+    return forward, backward, sides
 
 
 @inlined

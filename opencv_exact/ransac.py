@@ -87,16 +87,27 @@ class _Solution(NamedTuple):
 
 
 def find_essential_matrix(
-    current: np.ndarray, previous: np.ndarray, threshold: float, probability: float = 0.999
+    points1: np.ndarray,
+    points2: np.ndarray,
+    focal: float = 1.0,
+    pp: tuple[float, float] = (0.0, 0.0),
+    method: int = cv2.RANSAC,
+    prob: float = 0.999,
+    threshold: float = 1.0,
 ) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """Essential matrix and inliers, (E, mask), with the bits of OpenCV's own search.
+    """Essential matrix and inliers, (E, mask), with the bits of cv2.findEssentialMat.
 
-    That is cv2.findEssentialMat(current, previous, focal=1, pp=(0, 0), cv2.RANSAC, probability,
-    threshold).
-
-    current, previous: correspondences (N, 2), float64, normalised coordinates. E: 3x3, or OpenCV's
-    stack of solutions for N = 5, or None. mask: (N, 1) uint8, or None.
+    The arguments are OpenCV's, but only normalised coordinates and RANSAC are served. points1,
+    points2: correspondences (N, 2) or (N, 1, 2). E: 3x3, or OpenCV's stack of solutions for N = 5,
+    or None. mask: (N, 1) uint8, or None.
+    Raises ValueError for another camera or method.
     """
+    if focal != 1 or tuple(pp) != (0, 0) or method != cv2.RANSAC:
+        raise ValueError(
+            "find_essential_matrix: serves RANSAC on normalised coordinates, (pixel - pp) / focal, "
+            "with the threshold divided by focal"
+        )
+    current, previous = as_pairs(points1), as_pairs(points2)
     columns = np.stack([*current.T, *previous.T])
     solution = None
     if len(current) >= MIN_FOR_SHORTCUT and np.isfinite(columns).all():
@@ -104,10 +115,15 @@ def find_essential_matrix(
             columns32 = columns.astype(np.float32)
         max_abs = np.abs(columns).max(axis=1)
         limit = float(np.float32(threshold * threshold))
-        solution = _search(_Points(columns, columns32, max_abs, limit, threshold, probability))
+        solution = _search(_Points(columns, columns32, max_abs, limit, threshold, prob))
     if solution is None:
-        return _opencv(current, previous, threshold, probability)
+        return _opencv(current, previous, threshold, prob)
     return solution.matrix, solution.mask
+
+
+def as_pairs(points: np.ndarray) -> np.ndarray:
+    """Points (N, 2) or (N, 1, 2) as (N, 2) float64."""
+    return np.asarray(points, np.float64).reshape(-1, 2)
 
 
 def is_compiled() -> bool:

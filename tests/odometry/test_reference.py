@@ -11,12 +11,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
-import opencv_exact
 import thesis_repro
 from reference_steps import ESTIMATORS, FOLDER, STEPS, digest
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.masks.folders import MaskFolder
-from thesis_repro.odometry import THESIS, Matches, metrics
+from thesis_repro.odometry import THESIS, Matches, metrics, sharing
 from thesis_repro.odometry.loop import VoteOfAll, normalise
 from thesis_repro.odometry.refined import RefinedEstimator
 
@@ -48,11 +47,11 @@ def test_real_steps_have_the_recorded_bits(run):
     for step in recorded(run):
         points = step["current"], step["previous"]
         if IS_X86 or (run, step.get("frames")) not in OTHERWISE:
-            matrix, inliers = opencv_exact.find_essential_matrix(*points, THESIS.threshold)
+            matrix, inliers = sharing.find_essential_matrix(*points, THESIS.threshold)
             assert_recorded(matrix, step["matrices"])
             np.testing.assert_array_equal(inliers.ravel() > 0, step["inliers"])
         if step["solutions"] == 1:
-            votes, rotation, translation = opencv_exact.recover_pose(step["matrices"], *points)
+            votes, rotation, translation = sharing.recover_pose(step["matrices"], *points)
             assert votes == step["votes"]
             assert_recorded(rotation, step["rotations"])
             assert_recorded(translation, step["translations"])
@@ -83,7 +82,7 @@ def shuffled_motions(run, seed, moves):
     for step in recorded(run):
         order = np.random.default_rng((seed, step["frames"])).permutation(step["matches"])
         points = step["current"][order], step["previous"][order]
-        matrix, inliers = opencv_exact.find_essential_matrix(*points, THESIS.threshold)
+        matrix, inliers = sharing.find_essential_matrix(*points, THESIS.threshold)
         matches = Matches(*points, THESIS.threshold, inliers.ravel() > 0)
         motions.append((step, refined.motion(matrix, matches, step["scales"], moves)))
     return motions

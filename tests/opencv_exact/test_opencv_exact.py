@@ -43,7 +43,7 @@ def scene(random, count, outliers=0.3, noise=2e-4, motion=1.0, depth=(4, 40), tu
 
 def assert_same_bits(current, previous, threshold=THRESHOLD, probability=PROBABILITY):
     expected, expected_mask = opencv(current, previous, threshold, probability)
-    matrix, mask = find_essential_matrix(current, previous, threshold, probability)
+    matrix, mask = find_essential_matrix(current, previous, prob=probability, threshold=threshold)
     if expected is None:
         assert matrix is None
         return False
@@ -51,11 +51,11 @@ def assert_same_bits(current, previous, threshold=THRESHOLD, probability=PROBABI
     np.testing.assert_array_equal(mask, expected_mask)
     assert mask.dtype == expected_mask.dtype
     if matrix.shape == (3, 3):  # of five points there may be several
-        votes, rotation, translation, _ = cv2.recoverPose(matrix, current, previous)
         ours = recover_pose(matrix, current, previous)
-        assert ours[0] == votes
-        np.testing.assert_array_equal(ours[1], rotation)
-        np.testing.assert_array_equal(ours[2], translation.ravel())
+        for own, other in zip(ours, cv2.recoverPose(matrix, current, previous), strict=True):
+            np.testing.assert_array_equal(own, other)
+            assert np.shape(own) == np.shape(other)
+        assert ours[3].dtype == np.uint8
     return True
 
 
@@ -130,6 +130,15 @@ def test_other_thresholds_and_probabilities():
         assert_same_bits(*scene(random, 400), probability=probability)
 
 
+def test_other_inputs_are_served_as_opencv_does_or_refused():
+    current, previous = scene(np.random.default_rng(5), 100)
+    stacked = [np.float32(side).reshape(-1, 1, 2) for side in (current, previous)]
+    assert assert_same_bits(*stacked)
+    for options in ({"focal": 700.0}, {"pp": (600.0, 180.0)}, {"method": cv2.LMEDS}):
+        with pytest.raises(ValueError, match="normalised"):
+            find_essential_matrix(current, previous, **options)
+
+
 def test_few_samples_are_solved_by_opencv(monkeypatch):
     """This makes the search fast: OpenCV never does the whole search."""
     real, sizes = cv2.findEssentialMat, []
@@ -140,7 +149,7 @@ def test_few_samples_are_solved_by_opencv(monkeypatch):
 
     current, previous = scene(np.random.default_rng(1), 1000, outliers=0.5)
     monkeypatch.setattr(cv2, "findEssentialMat", noting)
-    find_essential_matrix(current, previous, THRESHOLD, PROBABILITY)
+    find_essential_matrix(current, previous, prob=PROBABILITY, threshold=THRESHOLD)
     assert 0 < len(sizes) < 60 and set(sizes) == {5}  # of about 200 samples
 
 
@@ -205,7 +214,7 @@ def test_bounds_hold_for_the_worst_matrices_within_the_margin():
     """The matrices are moved by the margin in the direction that changes one point most."""
     margin = 3e-5
     current, previous = scene(np.random.default_rng(4), 400)
-    matrix, _ = find_essential_matrix(current, previous, THRESHOLD, PROBABILITY)
+    matrix, _ = find_essential_matrix(current, previous, prob=PROBABILITY, threshold=THRESHOLD)
     e = matrix.ravel() / np.linalg.norm(matrix)
     points = searched(np.vstack([current.T, previous.T]))
     lower, upper = bounds(e, margin, points)

@@ -122,8 +122,11 @@ def _faster_calls(frames: int) -> Calls | None:
 
     if frames < FRAMES_TO_COMPILE and not opencv_exact.is_compiled():
         return None
-    search, vote = opencv_exact.find_essential_matrix, opencv_exact.recover_pose
-    return Calls(track=sharing.track, find_essential_matrix=search, recover_pose=vote)
+    return Calls(
+        track=sharing.track,
+        find_essential_matrix=sharing.find_essential_matrix,
+        recover_pose=sharing.recover_pose,
+    )
 
 
 def run_many(

@@ -11,7 +11,7 @@ import numpy as np
 
 import opencv_exact
 from thesis_repro.odometry import corners
-from thesis_repro.odometry.loop import TERMINATION, Calls
+from thesis_repro.odometry.loop import PROBABILITY, TERMINATION, Calls
 from thesis_repro.odometry.settings import THESIS, OdometrySettings
 
 
@@ -33,9 +33,7 @@ class SharedCalls:
     """
 
     def __init__(self) -> None:
-        self.calls = Calls(
-            self.detect, self.track, self.find_essential_matrix, opencv_exact.recover_pose
-        )
+        self.calls = Calls(self.detect, self.track, self.find_essential_matrix, recover_pose)
         self._start(None)
 
     def _start(self, frame: np.ndarray | None) -> None:
@@ -98,7 +96,7 @@ class SharedCalls:
         """Like `loop.find_essential_matrix`."""
         key = (current.tobytes(), previous.tobytes(), threshold)
         if key not in self._matrices:
-            self._matrices[key] = opencv_exact.find_essential_matrix(current, previous, threshold)
+            self._matrices[key] = find_essential_matrix(current, previous, threshold)
         return self._matrices[key]
 
     def _turn_to(self, frame: np.ndarray) -> None:
@@ -135,3 +133,20 @@ def track(
     window_corner = tracked - (window - 1) / 2  # upper left
     touches_frame = (window_corner >= -window) & (window_corner < current.shape[::-1])
     return tracked, (status.ravel() == 1) & touches_frame.all(axis=1)
+
+
+def find_essential_matrix(
+    current: np.ndarray, previous: np.ndarray, threshold: float
+) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """Like `loop.find_essential_matrix`, in less time."""
+    return opencv_exact.find_essential_matrix(
+        current, previous, prob=PROBABILITY, threshold=threshold
+    )
+
+
+def recover_pose(
+    matrix: np.ndarray, current: np.ndarray, previous: np.ndarray
+) -> tuple[int, np.ndarray, np.ndarray]:
+    """Like `loop.recover_pose`, in less time."""
+    votes, rotation, translation, _ = opencv_exact.recover_pose(matrix, current, previous)
+    return votes, rotation, translation.ravel()
