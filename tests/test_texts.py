@@ -7,6 +7,8 @@ import pytest
 import thesis_repro as tr
 import write_texts
 from keypoint_study import verdicts
+from keypoint_study.report import style
+from thesis import claims, equal_number
 from thesis_repro.odometry import metrics
 
 
@@ -38,10 +40,14 @@ def with_masks(monkeypatch):
         monkeypatch.setattr(
             write_texts, "read_table", lambda name: runs if name.endswith("/runs") else read(name)
         )
+        forget()
+
+    def forget():
         write_texts.compared.cache_clear()
+        write_texts.all_claims.cache_clear()
 
     yield change
-    write_texts.compared.cache_clear()
+    forget()
 
 
 @pytest.mark.parametrize(
@@ -56,8 +62,26 @@ def test_texts_say_every_outcome_of_the_runs(with_masks, factor, streets, outcom
     with_masks(factor, streets)
     assert write_texts.verdict() == outcome
     readme, answer = map(write_texts.render, ("README.md.j2", "answer.md.j2"))
-    assert f"masks are {write_texts.ERRORS[outcome]} those" in readme
-    assert write_texts.PATHS[outcome] in answer
+    said = f"rrors with masks are {write_texts.ERRORS[outcome]} those with all keypoints"
+    assert said in readme and said in answer
+
+
+def test_tables_made_from_tables_in_git_are_those_in_git():
+    folder = write_texts.ROOT / "figures" / write_texts.REAL
+    note, found = write_texts.data_note(), write_texts.all_claims()
+    text = (folder / "claims.md").read_text(encoding="utf-8")
+    assert text == claims.text_of_claims(found, note)
+    names = [claim.name for claim in found]
+    assert len(names) == len(set(names)) > 20 and {claim.word for claim in found} == set(
+        claims.RULE
+    )
+    pairs = equal_number.table_of_pairs(
+        write_texts.read_table(f"{write_texts.REAL}few_keypoints_runs"),
+        write_texts.read_table(f"{write_texts.REAL}runs"),
+        write_texts.read_table(f"{write_texts.REAL}new_streets")["sequence"].unique(),
+    )
+    table = (folder / "equal_number.md").read_text(encoding="utf-8")
+    assert table.startswith(style.markdown(pairs)) and note in table
 
 
 @pytest.mark.real

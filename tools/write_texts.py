@@ -14,7 +14,7 @@ import pandas as pd
 from keypoint_study import comparisons, ratios, verdicts, worth_runs
 from keypoint_study import worth as worths
 from keypoint_study.report import texts
-from thesis import few_keypoints
+from thesis import claims, equal_number, few_keypoints
 from thesis.settings import ROOT
 from thesis_repro.command import cli
 from thesis_repro.command.options import build_parser
@@ -27,27 +27,12 @@ WRITTEN |= {
     f"{name}.md.j2": ROOT / f"docs/{name}.md" for name in ("answer", "reading-results", "options")
 }
 REAL = "kitti_excerpts/"  # tables on real frames
-# how the texts say a verdict on the worth of a keypoint, and on errors
-TOO_FEW = "of too few streets to be compared with"
-TELLS = {
-    verdicts.LESS: "less than",
-    verdicts.MORE: "more than",
-    verdicts.AS_MUCH: "as much as",
-    verdicts.NO_CLEAR_DIFFERENCE: "not clearly more or less than",
-    verdicts.TOO_FEW: TOO_FEW,
-}
+# how the texts say a verdict on errors
 ERRORS = {
     verdicts.LOWER: "lower than",
     verdicts.HIGHER: "higher than",
     verdicts.NO_CLEAR_DIFFERENCE: "not clearly different from",
-    verdicts.TOO_FEW: TOO_FEW,
-}
-# the same in words for everybody
-PATHS = {
-    verdicts.LOWER: "made a camera's path more accurate",
-    verdicts.HIGHER: "made a camera's path less accurate",
-    verdicts.NO_CLEAR_DIFFERENCE: "made a camera's path neither clearly more nor less accurate",
-    verdicts.TOO_FEW: "was tried on too few streets",
+    verdicts.TOO_FEW: "of too few streets to be compared with",
 }
 NAMES = ("sequence", "row", "source", "metric", "estimator")  # columns of texts, if empty, too
 
@@ -100,6 +85,12 @@ def of_controls() -> list[str]:
     return [verdict(over=name) for name in comparisons.SEGMENTATION_FREE_CONTROLS]
 
 
+def keypoints_of_controls() -> tuple[float, float]:
+    """Return the least and the greatest mean number of keypoints of these controls."""
+    left = [error("se3", name)["keypoints"] for name in comparisons.SEGMENTATION_FREE_CONTROLS]
+    return min(left), max(left)
+
+
 def by_chance(estimator: str = "thesis") -> pd.Series:
     """Return the highest RMSE over the lowest of shuffled runs with all keypoints, by street."""
     rows = ratios.range_of_shuffles(read_table(f"{REAL}runs"))
@@ -135,20 +126,6 @@ def random_apart(number: int) -> list[str]:
     return apart
 
 
-def stay_without_any() -> bool:
-    """Whether the verdicts on errors with masks, and on the worth, stay without any one street."""
-    few_methods = "method in ('baseline', 'masked') and estimator == 'refined'"
-    found = set()
-    for street in ["", *read_table(f"{REAL}streets")["sequence"]]:
-        others = f"sequence != '{street}'"
-        where = f"{others} and {few_methods}"
-        rows = [error(metric, where=where) for metric in comparisons.JUDGING_METRICS]
-        chosen = ("masks", "spread keypoints")
-        told = [worth(choice, "direction", where=others)["verdict"] for choice in chosen]
-        found.add((comparisons.verdict_of(pd.DataFrame(rows)), *told))
-    return len(found) == 1
-
-
 def new_streets() -> str:
     """Return the condition of the streets on which nothing was chosen."""
     return f"sequence in {sorted(set(read_table(f'{REAL}new_streets')['sequence']))}"
@@ -166,35 +143,50 @@ def on_new_streets(choice: str, motion: str) -> str:
     return ", ".join(map(two, rows[motion]))
 
 
-def left_out(outcome: str) -> list[str]:
-    """Return the names of classes without which random keypoints have a verdict."""
-    rows = read_table(f"{REAL}left_out")
-    named = rows.loc[rows["a keypoint tells"] == outcome, "choice"]
-    return [name.removeprefix("without ") for name in named]
-
-
 def few(
     choice: str, number: int, metric: str, estimator: str = "refined", over: str = "all"
 ) -> dict[str, Any]:
-    """Return the numbers of `ratios.typical_ratio` for so many keypoints, and failed runs."""
+    """Return the numbers of `ratios.typical_ratio` for so many keypoints, and more.
+
+    end: the upper end of the interval of NARROW_LEVEL. failing: on how many streets half of the
+    runs fail. failures: the verdict on more or fewer failures.
+    """
     runs = read_table(f"{REAL}few_keypoints_runs").query("estimator == @estimator")
     chosen = runs.query("choice == @choice and number == @number")
     reference = runs.query("choice == @over and number in (0, @number)")
     of_streets = ratios.ratios_of(chosen, reference, metric)
-    keypoints = chosen["keypoints"].mean()
-    failed = int(chosen["failed"].sum())
-    return ratios.typical_ratio(of_streets) | {"keypoints": keypoints, "failed": failed}
+    failed, of_reference = (rows.set_index("sequence")["failed"] for rows in (chosen, reference))
+    return ratios.typical_ratio(of_streets) | {
+        "keypoints": chosen["keypoints"].mean(),
+        "end": ratios.narrow_interval(of_streets)[1],
+        "failing": streets(equal_number.failing(chosen)),
+        "failures": comparisons.failures(failed, of_reference)["failures_verdict"],
+    }
 
 
-def audit(row: str, quantity: str, metric: str = "", estimator: str = "") -> dict[str, Any]:
-    """Return value, low and high of a measurement of the audit on real frames."""
-    named = {"row": row, "quantity": quantity, "metric": metric, "estimator": estimator}
-    return {name: cell(f"{REAL}audit", name, named) for name in ("value", "low", "high")}
+def streets(of: str) -> str:
+    """Return "1" for "1 of 11"."""
+    return of.split()[0]
 
 
-def of_table_4_2(row: str, column: str) -> float:
-    """Return a number of Table 4.2 on real frames."""
-    return float(cell(f"{REAL}table_4_2", column, {"sequence": row}))
+def worth_range(choice: str, number: int = 400) -> str:
+    """Return the least and the greatest typical worth, of both motions and kinds of halves."""
+    typical = [
+        worth(choice, motion, split, number=number)["ratio"]
+        for motion, split in product(worths.MOTIONS, worths.SPLIT)
+    ]
+    return f"{min(typical):.1f} to {max(typical):.1f}"
+
+
+def metres() -> list[float]:
+    """Return how many metres masks add to the aligned ATE (refined), by street, least first."""
+    pair = equal_number.MASKS, equal_number.EVERY
+    tables = read_table(f"{REAL}few_keypoints_runs"), read_table(f"{REAL}runs")
+    means = [
+        rows.groupby("sequence")["se3"].mean()
+        for rows in equal_number.of_pair(*tables, pair, "refined")
+    ]
+    return sorted((means[0] - means[1]).abs())
 
 
 def of_few(choice: str, number: int, column: str, name: str = f"{REAL}few_keypoints") -> Any:
@@ -207,6 +199,41 @@ def of_rendered(metric: str) -> str:
     """Return an error of 200 spread keypoints over that of all in the embedded world."""
     text = of_few("spread", 200, f"{metric}, refined estimator", "few_keypoints")
     return re.sub(r"\).*", ")", text)
+
+
+def data_note() -> str:
+    """Return what stands below tables of real frames."""
+    streets = read_table(f"{REAL}streets")[["sequence", "frames"]].itertuples(index=False)
+    lengths = ", ".join(f"{name} ({frames} frames)" for name, frames in streets)
+    return f"odometry: real KITTI frames, {lengths}; label maps by the model in the package"
+
+
+@cache
+def all_claims() -> list[claims.Claim]:
+    """Return what became of each claim of the thesis."""
+    return claims.claims_of(read_table)
+
+
+def claim(name: str) -> claims.Claim:
+    """Return what became of one claim."""
+    (found,) = [each for each in all_claims() if each.name == name]
+    return found
+
+
+def equal(chosen: str, other: str, estimator: str = "refined") -> dict[str, Any]:
+    """Return two choices at an equal number: {se3, rotation (typical ratios), failing, hangs}.
+
+    chosen, other: of `equal_number.PAIRS`, or all on the mask and all keypoints. hangs: of
+    `equal_number.hangs_on`. failing: of both, the streets on which half of the runs fail.
+    """
+    few_runs, runs = read_table(f"{REAL}few_keypoints_runs"), read_table(f"{REAL}runs")
+    sides = equal_number.of_pair(few_runs, runs, (chosen, other), estimator)
+    of_streets = equal_number.over(*sides)
+    new = read_table(f"{REAL}new_streets")["sequence"].unique()
+    typical = {name: ratios.typical_ratio(of_streets[name]) for name in of_streets}
+    hangs = equal_number.hangs_on(of_streets, new)
+    failed = [streets(equal_number.failing(side)) for side in sides]
+    return {**typical, "hangs": hangs, "failing": failed}
 
 
 def commands() -> dict[str, Any]:
@@ -235,38 +262,46 @@ def with_interval(row: dict[str, Any]) -> str:
 def render(template: str) -> str:
     """Return the text that a template in docs/templates gives."""
     named = {function.__name__: function for function in FUNCTIONS}
-    return texts.render(template, **named, tells=TELLS, errors=ERRORS, paths=PATHS)
+    return texts.render(template, **named, errors=ERRORS)
 
 
 # that templates call
 FUNCTIONS = (
     read_table,
     commands,
-    cell,
     error,
     verdict,
     of_controls,
+    keypoints_of_controls,
     by_chance,
     worth,
     random_apart,
-    stay_without_any,
-    new_streets,
     new_streets_disagree,
     on_new_streets,
-    left_out,
     few,
     of_few,
-    audit,
-    of_table_4_2,
     of_rendered,
+    claim,
+    all_claims,
+    equal,
+    worth_range,
+    metres,
     whole,
     two,
     with_interval,
 )
 
 
+def write_tables() -> None:
+    """Write the tables that are made from other tables in git, and their figure."""
+    folder = ROOT / "figures" / REAL
+    equal_number.write(lambda name: read_table(f"{REAL}{name}"), folder, data_note())
+    write_text(folder / "claims.md", claims.text_of_claims(all_claims(), data_note()))
+
+
 def main() -> None:
-    """Write the texts."""
+    """Write the tables, then the texts."""
+    write_tables()
     for template, path in WRITTEN.items():
         write_text(path, render(template))
 

@@ -1,0 +1,80 @@
+"""What a verdict hangs on, with made-up streets of which one, two or a day decide."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from keypoint_study import ratios, verdicts
+from thesis import equal_number
+
+STREETS = sorted(street for streets in equal_number.DAYS.values() for street in streets)
+NEW = ("03", "04", "drive0009")
+
+
+def table(of_street):
+    """Ratios of both deciding errors: those given, and 1.2 (1.21, ...) on all other streets."""
+    usual = {street: 1.2 + 0.01 * place for place, street in enumerate(STREETS)}
+    return pd.DataFrame({name: usual | of_street for name in equal_number.DECIDING})
+
+
+def test_a_verdict_of_all_streets_hangs_on_none():
+    found = equal_number.hangs_on(table({}), NEW)
+    assert found == {
+        "verdict": verdicts.HIGHER,
+        "one": (11, 11),
+        "two": (55, 55),
+        "day": (3, 3),
+        "old": verdicts.HIGHER,
+        "easy": verdicts.HIGHER,
+        "student": verdicts.HIGHER,
+    }
+
+
+def test_a_verdict_that_hangs_on_streets_says_so():
+    """Two streets of one day hold against all others, so one pair and one day decide."""
+    found = equal_number.hangs_on(table({"05": 0.5, "06": 0.55}), NEW)
+    assert found["verdict"] == found["old"] == verdicts.NO_CLEAR_DIFFERENCE
+    assert (found["one"], found["two"], found["day"]) == ((11, 11), (54, 55), (2, 3))
+
+
+def test_fewer_than_six_streets_tell_nothing():
+    found = equal_number.hangs_on(table({}).iloc[:5], NEW)
+    assert found["verdict"] == verdicts.TOO_FEW and found["one"] == (5, 5)
+
+
+def test_half_of_the_runs_make_a_street_fail():
+    runs = pd.DataFrame({"sequence": list("aabbcc"), "failed": [1, 0, 0, 0, 1, 1]})
+    assert equal_number.failing(runs) == "2 of 3"
+
+
+def test_the_share_of_days_is_found():
+    random = np.random.default_rng(0)
+    found = [
+        np.mean([equal_number.share_of_days(np.exp(_errors(random, share))) for _ in range(100)])
+        for share in (0, 0.5, 0.99)
+    ]
+    # never below 0, so its mean is above 0 where days do not differ
+    assert found == pytest.approx([0.1, 0.45, 0.97], abs=0.1)
+
+
+@pytest.mark.torture
+def test_how_often_streets_of_one_day_mislead(capsys):
+    """Prints percent of studies without a difference whose interval excludes 1."""
+    random, rates = np.random.default_rng(0), {}
+    for share in (0, 0.4):
+        intervals = [ratios.typical_interval(_errors(random, share))[1:] for _ in range(2000)]
+        sides = [ratios.side_of_one(*np.exp(ends)) for ends in intervals]
+        rates[share] = np.count_nonzero(sides) / 20
+    with capsys.disabled():
+        print(f"\nan interval errs (%), by the share of variance of a day: {rates}")
+    assert rates[0] < 6 < rates[0.4]
+
+
+def _errors(random, share):
+    """Logarithms of ratios without a difference; a day has a share of their variance."""
+    days = [street for streets in equal_number.DAYS.values() for street in streets]
+    of_days = np.repeat(
+        random.normal(0, np.sqrt(share), len(equal_number.DAYS)),
+        [len(streets) for streets in equal_number.DAYS.values()],
+    )
+    return pd.Series(of_days + random.normal(0, np.sqrt(1 - share), len(days)), days)
