@@ -126,11 +126,6 @@ def random_apart(number: int) -> list[str]:
     return apart
 
 
-def new_streets() -> str:
-    """Return the condition of the streets on which nothing was chosen."""
-    return f"sequence in {sorted(set(read_table(f'{REAL}new_streets')['sequence']))}"
-
-
 def new_streets_disagree(choice: str) -> bool:
     """Whether the new streets disagree with the others on a choice (`worth_runs`)."""
     rows = read_table(f"{REAL}worth_runs").query("number == 400 and choice == @choice")
@@ -176,6 +171,14 @@ def worth_range(choice: str, number: int = 400) -> str:
         for motion, split in product(worths.MOTIONS, worths.SPLIT)
     ]
     return f"{min(typical):.1f} to {max(typical):.1f}"
+
+
+def day_share() -> float:
+    """Return the share of variance that days have in the aligned ATE with masks (refined)."""
+    pair = equal_number.MASKS, equal_number.EVERY
+    tables = read_table(f"{REAL}few_keypoints_runs"), read_table(f"{REAL}runs")
+    of_streets = equal_number.over(*equal_number.of_pair(*tables, pair, "refined"))
+    return equal_number.share_of_days(of_streets["se3"])
 
 
 def metres() -> list[float]:
@@ -285,6 +288,7 @@ FUNCTIONS = (
     all_claims,
     equal,
     worth_range,
+    day_share,
     metres,
     whole,
     two,

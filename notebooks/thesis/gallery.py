@@ -81,7 +81,7 @@ def _of_real_frames(settings: Settings) -> list[dict[str, Any]]:
         [artefact for artefact in captions.ADDED if artefact["name"] in names]
         for names in (["few_keypoints"], ["comparison", "widths"])
     )
-    chapter = [*few, *captions.CHAPTERS["Chapter 4: results"], *others]
+    chapter = [*captions.CHAPTERS["Chapter 4: results"], *few, *others]
     real = replace(settings, kitti_is_embedded=False)
     described = _described(chapter, real, settings.published / REAL)
     for artefact in described:

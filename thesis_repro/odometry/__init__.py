@@ -4,7 +4,8 @@ A step finds Shi-Tomasi keypoints, tracks them by Lucas-Kanade, and estimates th
 and from it the pose.
 
 `run(sequence)` runs it once. `run_many` runs it with many settings or masks and shares work between
-the runs. With the settings THESIS, the result equals that of PySLAM of August 2021 on every frame.
+the runs. With the settings THESIS, motions equal those of PySLAM of August 2021 on the real frames
+on which both were run (tests/reference).
 On some frames PySLAM crashes; here a rule says what happens. Doubtful frames get a flag. "Kept"
 means that the pose does not change:
 
