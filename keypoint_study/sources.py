@@ -190,7 +190,7 @@ def read_path(path: Path, sequence: Sequence) -> np.ndarray:
     The file has poses with times, or one for each frame: of the sequence or, because it may be only
     a part of them, of its folder. Raises InputError if a frame has no pose.
     """
-    _, poses = read_truth(path, sequence.times)
+    _, poses = read_truth(path, sequence.times if sequence.has_times else None)
     frames = images(sequence.frame_paths[0].parent)
     if len(poses) == len(frames):
         place = {frame: index for index, frame in enumerate(frames)}

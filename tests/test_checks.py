@@ -114,9 +114,20 @@ def test_a_centre_far_from_the_middle_and_steps_that_were_left_out(tiny_kitti):
     (tiny_kitti / "sequences/00/calib.txt").write_text("P0: 50 0 37 0 0 50 24 0 0 0 1 0\n")
     (line,) = checks.sequence_warnings(Sequence(tiny_kitti, "00"))
     assert line.startswith("sequence 00: calib.txt") and "37, 24" in line
+    # a camera that stands explains as many flags
+    assert checks.run_warnings("00", frames=100, failed=78, standing=70) == []
+    assert len(checks.run_warnings("00", frames=100, failed=78, standing=40)) == 1
     assert checks.run_warnings("00", frames=100, failed=50, dropped=9) == []
     failed, dropped = checks.run_warnings("00", 100, 51, 10, 0.1)
     assert "51 of 100" in failed and "10 of 100" in dropped and "--scale-gate" in dropped
+
+
+def test_a_camera_that_stands_is_told(tiny_kitti):
+    lines = [f"1 0 0 0 0 1 0 0 0 0 1 {0.001 * index}\n" for index in range(4)]
+    (tiny_kitti / "poses/00.txt").write_text("".join(lines))
+    sequence = Sequence(tiny_kitti, "00")
+    (line,) = checks.sequence_warnings(sequence)
+    assert "stands in 3 of 3 steps" in line and checks.standing(sequence) == 3
 
 
 STREET = np.repeat([[23], [11], [7]], 16, axis=0).repeat(64, axis=1).astype(np.uint8)

@@ -121,7 +121,9 @@ def test_the_recipes_for_what_people_bring_run(examples, tmp_path):
     assert counts[0] == len(plain) and own["result"].frames["updated"][1:].all()
 
     first = cv2.imread("my-drive/000001.png", cv2.IMREAD_UNCHANGED)
-    assert len(list((tmp_path / "my-drive").iterdir())) == len(images)
+    assert len(list((tmp_path / "my-drive").glob("*.png"))) == len(images)
+    times = np.loadtxt(tmp_path / "my-drive/times.txt")
+    np.testing.assert_allclose(times, np.arange(len(images)) / 25)
     assert first.ndim == 2 and first.dtype == np.uint8
 
 

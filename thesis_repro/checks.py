@@ -16,17 +16,15 @@ from typing import Any
 import numpy as np
 
 from thesis_repro.data import cityscapes, kitti
+from thesis_repro.data.geometry import centre_doubt
+from thesis_repro.data.memory import are_impossible
 from thesis_repro.errors import InputError, one_line
 from thesis_repro.masks import coverage
 from thesis_repro.masks.folders import LabelMasks, MaskFolder
 from thesis_repro.running import files
 
-# Of the principal point from the middle, in frame widths and heights. KITTI has at most 0.04.
-# Frames are cropped at their upper or lower edge more often than at their sides.
-MAX_CENTRE_OFFSET = 0.075, 0.15
-# What drives stays below them; KITTI's car reaches 2.8 m a frame and 26 m/s.
-MAX_STEP, MAX_SPEED = 50.0, 100.0  # metres a frame, metres a second
 MAX_GAP = 10  # intervals between frames
+STANDING = 0.01  # metres; no direction can be told of a shorter step
 MASK_SAMPLES = 6  # frames whose masks are looked at
 MIN_SHARE = 0.005  # of the frames: that masks keep, and of a class that is named
 # Classes that fill less than MAX_SELDOM of a street's frames: all but these
@@ -138,16 +136,14 @@ def report(
 
 def sequence_warnings(sequence: kitti.Sequence) -> list[str]:
     """Warn of a principal point far from the middle of the frames, and of impossible steps."""
-    height, width = sequence.size
-    u, v = sequence.intrinsics[:2, 2]
-    across, down = MAX_CENTRE_OFFSET
-    warnings = []
-    if abs(u / width - 0.5) > across or abs(v / height - 0.5) > down:
-        warnings.append(
-            f"sequence {sequence.name}: {sequence.calibration_path.name} has the centre {u:g}, {v:g}, far "
-            f"from the middle of frames of {width}x{height} pixels; it must belong to frames of this size"
-        )
-    return warnings + sequence.doubts() + _step_warnings(sequence)
+    doubt = centre_doubt(sequence.intrinsics, sequence.size)
+    place = f"sequence {sequence.name}: {sequence.calibration_path.name}: "
+    return [place + doubt] * bool(doubt) + sequence.doubts() + _step_warnings(sequence)
+
+
+def standing(sequence: kitti.Sequence) -> int:
+    """Return the number of true steps in which the camera hardly moves, so that flags are right."""
+    return int((sequence.scales[1:] < STANDING).sum()) if sequence.has_truth else 0
 
 
 def _step_warnings(sequence: kitti.Sequence) -> list[str]:
@@ -156,11 +152,15 @@ def _step_warnings(sequence: kitti.Sequence) -> list[str]:
     lengths, unit = sequence.scales[1:], "times in seconds, and the speed in metres a second"
     if sequence.has_truth:
         unit = "true positions in metres, and times in seconds"
-    impossible = lengths > MAX_STEP
-    if sequence.has_times:
-        impossible |= lengths > MAX_SPEED * intervals
-    gaps = intervals > MAX_GAP * (np.median(intervals) if len(intervals) else 0)
+    impossible = are_impossible(lengths, intervals if sequence.has_times else None)
+    gaps = intervals > MAX_GAP * sequence.usual_interval
     warnings = []
+    if 2 * standing(sequence) > len(lengths):
+        warnings.append(
+            f"sequence {sequence.name}: the camera stands in {standing(sequence)} of {len(lengths)} steps, "
+            f"which are shorter than {STANDING:g} m (median {np.median(lengths):.2g} m), so flags and "
+            "wrong directions are no wonder"
+        )
     if impossible.any():
         first = impossible.argmax()
         warnings.append(
@@ -173,22 +173,28 @@ def _step_warnings(sequence: kitti.Sequence) -> list[str]:
         warnings.append(
             f"sequence {sequence.name}: gaps in the times: {gaps.sum()}; the first is "
             f"{intervals[first]:.3g} s, before {sequence.frame_paths[first + 1].name}; the odometry cannot "
-            "bridge them, so run the parts on their own"
+            f"bridge them, so run the parts on their own (--frames {first + 1} takes the first one)"
         )
     return warnings
 
 
 def run_warnings(
-    name: str, frames: int, failed: int, dropped: int = 0, scale_gate: float = 0.1
+    name: str,
+    frames: int,
+    failed: int,
+    dropped: int = 0,
+    scale_gate: float = 0.1,
+    standing: int = 0,
 ) -> list[str]:
     """Warn if many steps of a run failed or were dropped.
 
     name: of the sequence. frames, failed, dropped: numbers of frames, of steps with a flag, and of
     steps that were no longer than the scale gate (metres), so that their motion was left out.
+    standing: steps in which the camera stands, which may have a flag.
     """
     told = [
         (
-            failed > frames / 2,
+            failed - standing > (frames - standing) / 2,
             f"{failed} of {frames} frames have a flag; do frames, calibration and poses fit together?",
         ),
         (

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from thesis_repro import odometry
 from thesis_repro.command.cli import main
-from thesis_repro.data import kitti, label_ids, trajectories
+from thesis_repro.data import cameras, kitti, label_ids, trajectories
 from thesis_repro.data.cameras import DISTORTIONS
 from thesis_repro.data.cityscapes import (
     COLORS,
@@ -22,7 +22,7 @@ from thesis_repro.data.cityscapes import (
     read_image,
     resize_bilinear,
 )
-from thesis_repro.data.frames import white_level
+from thesis_repro.data.frames import times_in_names, white_level
 from thesis_repro.data.ids import names
 from thesis_repro.data.trajectories import read_poses, read_poses_at, write_tum
 from thesis_repro.errors import InputError
@@ -134,12 +134,19 @@ def test_ground_truth_with_times_is_given_to_the_frames_of_these_times(own, name
     np.testing.assert_allclose(sequence.times, [0.1, 0.2, 0.3])
     np.testing.assert_allclose(sequence.poses[:, 2, 3], [0, 20, 40])
     assert "3 of 4 frames" in caplog.text
-    for first, text in ((0, "found no matching timestamps"), (None, "000002.png has no pose")):
-        at = times + 100 if first == 0 else times
-        kept = np.abs(at - 0.2) > 0.02
-        write(own / name, poses[kept], at[kept])
-        with pytest.raises(InputError, match=rf"{name}: .*{text}"):
-            kitti.Sequence(None, own, truth=own / name)
+    kept = np.abs(times - 0.2) > 0.02  # a gap around the third frame
+    write(own / name, poses[kept], times[kept])
+    sequence = kitti.Sequence(None, own, truth=own / name)
+    assert [path.stem for path in sequence.frame_paths] == ["000001", "000003"]
+    np.testing.assert_allclose(sequence.poses[:, 2, 3], [0, 40])
+    assert "2 of 4 frames, which are used; 1 between them, the first one 000002.png" in caplog.text
+    sequence = kitti.Sequence(None, own, truth=own / name, truth_within=0.03)
+    np.testing.assert_allclose(sequence.poses[:, 2, 3], [0, 24, 40])
+    sequence = kitti.Sequence(None, own, speed=2)  # needs no pose
+    np.testing.assert_allclose(sequence.scales, [0, 0.2, 0.2, 0.2])
+    write(own / name, poses, times + 100)
+    with pytest.raises(InputError, match=rf"{name}: no pose .*100.102 to 100.347.*0 to 0.3"):
+        kitti.Sequence(None, own, truth=own / name)
     with pytest.raises(InputError, match="gone.txt: cannot be read"):
         kitti.Sequence(None, own, truth=own / "gone.txt")
 
@@ -329,6 +336,30 @@ distortion_coefficients: [-0.3, 0.1, 0.01, -0.02]
 """
 
 
+INDENTED = "".join(f"  {line.replace(' ', ': ')}\n" for line in CAMERA.splitlines())
+VINS = f"""%YAML:1.0
+---
+model_type: PINHOLE
+camera_name: camera
+image_width: 64
+image_height: 48
+distortion_parameters:
+{"".join(INDENTED.splitlines(keepends=True)[4:])}projection_parameters:
+{"".join(INDENTED.splitlines(keepends=True)[:4])}"""
+OKVIS = """%YAML:1.0
+cameras:
+     - {T_SC:
+        [ 0.0, -1.0, 0.0, -0.02, 1.0, 0.0, 0.0, -0.06, 0.0, 0.0, 1.0, 0.01, 0.0, 0.0, 0.0, 1.0],
+        image_dimension: [64, 48],
+        distortion_coefficients: [-0.3, 0.1, 0.01, -0.02],
+        distortion_type: radialtangential,
+        focal_length: [50, 51.0],
+        principal_point: [32, 24]}
+     - {image_dimension: [64, 48], distortion_coefficients: [0, 0, 0, 0],
+        focal_length: [60, 61], principal_point: [31, 23]}
+imu_params:
+    T_BS: [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
+"""
 K = [50.0, 0.0, 32.0, 0.0, 51.0, 24.0, 0.0, 0.0, 1.0]
 D = NUMBERS[4:]
 
@@ -350,10 +381,15 @@ def block(numbers):
         ("camera.yaml", ROS),
         ("camera.yaml", CAMERA_INFO),
         ("camera.yaml", EUROC),
-        *(("camera.yaml", f"K: {K}\n{key}: {D}\n") for key in DISTORTIONS),
+        *(("camera.yaml", f"K: {K}\n{key}: {D}\n") for (key,) in DISTORTIONS),
         ("camera.yaml", "".join(f"{key}:\n{block(of)}" for key, of in (("k", K), ("d", D)))),
         ("camera.yaml", f"camera_matrix: {[K[:3], K[3:6], K[6:]]}\ndist_coeff: {[D]}\n"),
         ("camera.yaml", f"camera_model: plumb_bob\n{CAMERA_INFO}"),
+        ("camera.yaml", f"{ORB_SLAM}Viewer.PointSize:2\nCamera.cols:64\nCamera.rows:\t48\n"),
+        ("camera.yaml", f"%YAML:1.0\n{ORB_SLAM.replace(': ', ':')}"),
+        ("camera.yaml", "Camera:\n  model: perspective\n" + INDENTED),
+        ("camera.yaml", VINS),
+        ("camera.yaml", OKVIS),
     ],
 )
 def test_distortion_is_taken_out_as_opencv_does(own, name, text):
@@ -371,7 +407,8 @@ def test_distortion_is_taken_out_as_opencv_does(own, name, text):
     "name, text",
     [
         ("camera.txt", "50 50 32 24 0.1"),
-        ("camera.txt", "P0: 50 0 32"),
+        ("camera.txt", "50 2 32 0 51 24 0 0 1"),  # skew
+        ("camera.txt", "50 0 0 0 51 0 32 24 1"),  # transposed
         *(("camera.yaml", text) for text in ("a: [1", "", "- 1", "K: {a: 1}", "T_BS: [1]", "\t")),
         ("camera.yaml", OPENCV.replace(".1, 0.01, -0.02 ]", ".1 ]")),
         ("camera.yaml", KALIBR.replace("intrinsics", "extrinsics")),
@@ -395,6 +432,9 @@ def test_another_file_is_no_camera(own, name, text):
         (KALIBR.replace("pinhole", "omni"), "camera_model is omni"),
         (ROS.replace("plumb_bob", "fisheye"), "distortion_model is fisheye"),
         (f'Camera.type: "KannalaBrandt8"\n{ORB_SLAM}', "Camera.type is KannalaBrandt8"),
+        (VINS.replace("PINHOLE", "MEI"), "model_type is MEI"),
+        (OKVIS.replace("radialtangential", "equidistant"), "distortion_type is equidistant"),
+        ('%YAML:1.0\nimu: 1\ncam0_calib: "left.yaml"\n', "holds no camera, but names left.yaml"),
     ],
 )
 def test_a_camera_of_another_model_is_named(own, text, model):
@@ -412,6 +452,8 @@ def test_a_camera_of_another_model_is_named(own, text, model):
         EUROC.replace("64, 48", "48, 64"),
         KALIBR.replace("64, 48", "640, 480"),
         f"Camera.width: 63\nCamera.height: 48\n{ORB_SLAM}",
+        f"Camera.cols: 63\nCamera.rows: 48\n{ORB_SLAM}",
+        OKVIS.replace("[64, 48]", "[752, 480]"),
     ],
 )
 def test_a_camera_of_frames_of_another_size_is_named(own, text):
@@ -419,6 +461,79 @@ def test_a_camera_of_frames_of_another_size_is_named(own, text):
     sequence = kitti.Sequence(None, own, calibration=own / "camera.yaml")
     with pytest.raises(InputError, match=r"camera.yaml: .*, but .*000000.png has 64x48"):
         sequence.frame(0)
+
+
+KITTIS = """S_00: 1.392e+03 5.12e+02
+P_rect_00: 50 0 32 0 0 51 24 0 0 0 1 0
+S_rect_00: 64 48
+P_rect_02: 60 0 31 5 0 61 23 0 0 0 1 0
+S_rect_02: 65 48
+"""
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "50 0 32\n0 51 24\n0 0 1\n",
+        "# K\n[[50, 0, 32],\n [0, 51, 24],\n [0, 0, 1]]\n",
+        "50,0,32,0\n0,51,24,0\n0,0,1,0\n0,0,0,1\n",
+        "50 0 32 0 0 51 24 0 0 0 1 0\n",
+        "P0: 50 0 32 0 0 51 24 0 0 0 1 0\nP1: 50 0 32 -25 0 51 24 0 0 0 1 0\n",
+        KITTIS,
+    ],
+)
+def test_a_camera_is_a_matrix(own, text):
+    (own / "camera.txt").write_text(text)
+    sequence = kitti.Sequence(None, own, calibration=own / "camera.txt")
+    assert np.array_equal(sequence.intrinsics, [[50, 0, 32], [0, 51, 24], [0, 0, 1]])
+    assert not sequence.distortion.any() and sequence.size == (48, 64)
+
+
+def test_a_file_of_several_cameras_is_read_for_the_one_that_is_used(own):
+    (own / "chain.yaml").write_text(KALIBR.replace("omni", "pinhole"))
+    (own / "okvis.yaml").write_text(OKVIS)
+    (own / "raw.txt").write_text(KITTIS)
+    assert cameras.read_camera(own / "okvis.yaml", "cam1").matrix[0, 0] == 60
+    assert cameras.read_camera(own / "raw.txt", "image_02").size == (48, 65)
+    np.testing.assert_allclose(
+        cameras.read_camera(own / "chain.yaml", "cam0").body[:3, 3], [0.01, -0.06, 0.01]
+    )
+    for name, camera in (("chain.yaml", "cam2"), ("okvis.yaml", "cam2"), ("raw.txt", "image_01")):
+        with pytest.raises(InputError, match=name):
+            cameras.read_camera(own / name, camera)
+
+
+@pytest.mark.parametrize(
+    "stems, times",
+    [
+        (["1403636579763555584", "1403636579813555584"], 0.05),
+        (["1403636579763555", "1403636579813555"], 0.05),
+        (["frame_1403636579763", "frame_1403636579813"], 0.05),
+        (["cam0_0001_1403636579763555584", "cam0_0002_1403636579813555584"], 0.05),
+        (["rgb-1305031102.175304_left", "rgb-1305031102.225304_left"], 0.05),
+        (["1403636579_763555584", "1403636579_813555584"], 0.05),
+        (["1403636579_63555584", "1403636579_113555584"], 0.05),
+        (["1403636579_763555", "1403636579_813555"], 0.05),
+        (["1403636579813555", "frame_7"], None),
+        (["20110926_130225", "20110926_130226"], None),
+    ],
+)
+def test_times_in_names(own, stems, times):
+    found = times_in_names([own / f"{stem}.png" for stem in stems])
+    if times is None:
+        assert found is None
+        return
+    np.testing.assert_allclose(np.diff(found), times, atol=1e-6)
+    assert 1.3e9 < found[0] < 1.5e9
+
+
+def test_what_has_no_stated_times_is_not_matched_by_time(own):
+    write_tum(own / "truth.txt", POSES, np.arange(4) / 30)
+    (own / "times.txt").unlink()
+    with pytest.raises(InputError, match="truth.txt: .*--fps"):
+        kitti.Sequence(None, own, truth=own / "truth.txt")
+    poses = kitti.Sequence(None, own, truth=own / "truth.txt", fps=30).poses
+    np.testing.assert_allclose(poses, POSES, atol=1e-9)
 
 
 def test_a_rough_camera_is_four_numbers(own):

@@ -177,7 +177,7 @@ def test_a_folder_of_drives_is_a_root_and_a_link_a_sequence(drive, tiny_kitti):
         sequence = kitti.Sequence(root, name)
         assert sequence.name == name and np.array_equal(sequence.poses, expected.poses)
         assert checks.check_kitti(root) == []
-    assert [folder for folder, _ in cli._image_folders(drive.parent)] == [drive]
+    assert [folder for folder, *_ in cli._image_folders(drive.parent)] == [drive]
 
 
 def test_a_gps_without_a_lock_is_told(drive):

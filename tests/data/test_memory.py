@@ -54,12 +54,34 @@ def test_steps_have_the_lengths_that_were_given(street, lengths, expected):
         {"poses": np.ones((6, 4, 4))},
         {"poses": np.eye(4)},
         {"times": [1]},
+        {"times": [5] * 6, "scales": [1] * 6},
+        {"times": [0, 1, 2, 3, 5, 4], "speed": 3},
     ],
 )
 def test_wrong_arrays_are_named(street, wrong):
     given = {"frames": street.images, "intrinsics": street.intrinsics} | wrong
     with pytest.raises(InputError, match=next(iter(wrong))):
         tr.Sequence.from_arrays(**given)
+
+
+@pytest.mark.parametrize("unit, impossible", [(1, 0), (1e3, 5), (1e9, 5)])
+def test_times_in_other_units_are_told(street, caplog, unit, impossible):
+    drive(street, speed=8, times=unit * 0.1 * np.arange(6))
+    assert [f"{impossible} of 5 steps are impossible" in line for line in caplog.messages] == (
+        [True] if impossible else []
+    )
+
+
+def test_more_masks_than_frames_and_a_centre_far_off_are_told(street, caplog):
+    tr.run(drive(street), masks=[np.ones(street.size, bool)] * 6)
+    assert caplog.messages == []
+    tr.run(drive(street), masks=[np.ones(street.size, bool)] * 7)
+    (line,) = caplog.messages
+    assert line.startswith("masks: 7 for 6 frames")
+    camera = street.intrinsics.copy()
+    camera[:2, 2] = 91, 40
+    tr.run(tr.Sequence.from_arrays(street.images, camera))
+    assert "the centre 91, 40 is far from the middle" in caplog.messages[-1]
 
 
 def test_without_poses_there_is_no_truth_and_no_folder_of_masks(street, tmp_path):

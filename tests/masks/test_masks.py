@@ -1,4 +1,5 @@
 import platform
+import shutil
 import zlib
 
 import cv2
@@ -6,10 +7,12 @@ import numpy as np
 import pytest
 
 from thesis_repro import masks
+from thesis_repro.data.cameras import Camera
 from thesis_repro.data.cityscapes import ID, resize_bilinear
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.masks import MaskSettings, folders
+from thesis_repro.running import provenance
 
 SIZE = (376, 1240)
 # on x86_64
@@ -220,6 +223,10 @@ def test_wrong_arguments_are_named(labelled):
     for width in (0, 2.0):
         with pytest.raises(InputError, match=f"dilation width {width}"):
             folders.LabelMasks(folder, sequence, width)
-    sequence.distortion = np.ones(4)
-    with pytest.raises(InputError, match="labels: .*--calibration"):
-        folders.LabelMasks(folder, sequence, 4)
+    sequence.lens = Camera(np.eye(3), np.ones(4))
+    folders.LabelMasks(folder, sequence, 4)  # somebody's, of whichever frames
+    provenance.stage(folder / "predicted", model="of raw frames")
+    for path in sequence.frame_paths:
+        shutil.copy(folder / path.name, folder / "predicted")
+    with pytest.raises(InputError, match="predicted: made of frames with other distortion"):
+        folders.LabelMasks(folder / "predicted", sequence, 4)

@@ -161,3 +161,22 @@ def test_true_poses_that_are_not_the_cameras_are_told(change, kind):
     # what did not move, and too few steps, say nothing
     assert metrics.foreign_poses(change(true), np.tile(np.eye(4), (60, 1, 1))) == ""
     assert metrics.foreign_poses(change(true)[:9], estimated[:9]) == ""
+    # steps that are too short alone count over a distance
+    slow, slowly = winding(120), winding(120)
+    slow[:, :3, 3] *= 0.1
+    slowly[:, :3, 3] = 0.1 * slowly[:, :3, 3] + np.random.default_rng(1).normal(0, 0.002, (120, 3))
+    assert metrics.travelled(slow)[-1] / 120 < 0.15
+    told = metrics.foreign_poses(change(slow), slowly)
+    assert told == "" if kind is None else kind in told
+
+
+def test_poses_without_rotations_are_told():
+    true = winding(60)
+    positions = np.tile(np.eye(4), (60, 1, 1))
+    positions[:, :3, 3] = true[:, :3, 3]
+    turned = AXES @ positions @ AXES.T  # as of a satellite: east, north, up
+    for poses in (positions, turned, turned @ AXES):
+        assert "no rotations" in metrics.foreign_poses(poses, true)
+    straight = np.tile(np.eye(4), (60, 1, 1))
+    straight[:, 2, 3] = np.arange(60)
+    assert metrics.foreign_poses(straight, straight) == ""  # a camera that does not turn

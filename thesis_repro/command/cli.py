@@ -57,18 +57,18 @@ def predict(options: Any) -> None:
     """
     from thesis_repro.segmentation import quietly
 
-    images = _image_folders(options.images)
+    images = _image_folders(options.images, options.calibration)
     _check_outputs(options, options.images)
     with quietly():  # this import takes seconds, so the files are checked first
         from thesis_repro.segmentation import prediction, training
     model = training.load_model(options.model or prediction.SHIPPED)
     lines, reused = [], 0
-    for folder, paths in images:
+    for folder, paths, lens in images:
         output = options.folder
         if folder != options.images:  # one of several sequences
             output /= folder.name
-        paths = paths[: options.frames]
-        new = prediction.write_label_maps(model, paths, output, scale=float(options.scale))
+        paths, scale = paths[: options.frames], float(options.scale)
+        new = prediction.write_label_maps(model, paths, output, scale=scale, lens=lens)
         reused += len(paths) - new
         lines.append(f"{output}: {len(paths)} label maps")
     program.summary("\n".join(lines), reused)
@@ -118,10 +118,17 @@ def odometry(options: Any) -> None:
     if options.tum:
         write_tum(options.tum, result.poses, sequence.times)
     steps = len(sequence), result.failed_steps, result.dropped_steps
-    _warn(checks.run_warnings(sequence.name, *steps, settings.scale_gate))
+    standing = checks.standing(sequence)
+    _warn(checks.run_warnings(sequence.name, *steps, settings.scale_gate, standing))
     if sequence.has_truth:
         reason = metrics.foreign_poses(sequence.poses, result.poses)
         _warn([f"{sequence.poses_path}: true {reason}"] * bool(reason))
+        length = metrics.travelled(sequence.poses)[-1]
+        if not reason and length < metrics.CHECKED_LENGTH:
+            program.log.info(
+                f"{sequence.poses_path}: the path, {length:.2g} m, is too short to check that true poses have the "
+                "camera's axes"
+            )
     record = _record(result, sequence)
     if options.plot:
         truth, poses = None, result.poses
@@ -199,8 +206,14 @@ def study(options: Any) -> int:
         table = outcome.table
         shown = table["dilation_width"].isna() | (table["dilation_width"] == planned.shown_width)
         runs = table[shown & table["method"].isin(("baseline", "masked", "keypoints"))]
+        standing = {sequence.name: checks.standing(sequence) for sequence in planned.opened}
         of_runs = [
-            checks.run_warnings(f"{run.sequence} {run.source}".strip(), run.frames, run.flagged)
+            checks.run_warnings(
+                f"{run.sequence} {run.source}".strip(),
+                run.frames,
+                run.flagged,
+                standing=standing[run.sequence],
+            )
             for run in runs.drop_duplicates(["sequence", "source"]).itertuples()
         ]
         warnings += outcome.warnings + _warn(chain(*of_runs))
@@ -282,10 +295,9 @@ def _text(record: dict[str, Any], sequence: Any, speed: float | None) -> str:
         ]
     else:
         steps = "1 m a frame" if speed is None else f"{speed:g} m/s"
-        lines.append(
-            f"no ground truth to compare with ({one_line(sequence.poses_path)} does not exist); "
-            f"assumed steps: {steps}"
-        )
+        place = one_line(sequence.poses_path)
+        state = "is not used" if sequence.poses_path.exists() else "does not exist"
+        lines.append(f"no ground truth to compare with ({place} {state}); assumed steps: {steps}")
     lines += [
         f"mean keypoints  {record['mean_keypoints']:.1f}",
         f"time a frame    {record['ms_per_frame']:.1f} ms",
@@ -332,7 +344,8 @@ def _detector(options: Any) -> Any:
 def _sequence(options: Any) -> Any:
     from thesis_repro.data.kitti import Sequence
 
-    own = {name: vars(options).get(name) for name in ("speed", "fps", "truth", "calibration")}
+    names = "speed", "fps", "truth", "calibration", "truth_within"
+    own = {name: vars(options)[name] for name in names if name in vars(options)}
     sequence = Sequence(options.kitti, options.sequence, options.camera, **own)
     sequence = sequence.subset(options.frames)
     if vars(options).get("without_border"):
@@ -361,13 +374,13 @@ def _warn(lines: Iterable[str]) -> list[str]:
     return warnings
 
 
-def _image_folders(root: Path) -> list[tuple[Path, list[Path]]]:
-    """Return (folder, its images) for each sequence that a path names.
+def _image_folders(root: Path, calibration: Path | None = None) -> list[tuple[Path, list, Any]]:
+    """Return (folder, its images, their camera) for each sequence that a path names.
 
-    The path is a folder of images, a sequence, a KITTI folder or a folder of sequences.
-    Raises InputError if there are no images.
+    The path is a folder of images, a sequence, a KITTI folder or a folder of sequences. Without a
+    calibration that can be read, the camera is None. Raises InputError if there are no images.
     """
-    from thesis_repro.data import layout
+    from thesis_repro.data import cameras, layout
 
     folders = [root]
     if root.is_dir() and not layout.has_frames(root):
@@ -375,7 +388,16 @@ def _image_folders(root: Path) -> list[tuple[Path, list[Path]]]:
         if not parent.is_dir():
             parent = root
         folders = layout.folders_with_frames(parent) or [root]
-    return [(folder, layout.files(folder).frames) for folder in folders]
+    found = []
+    for folder in folders:
+        files, lens = layout.files(folder), None
+        if calibration is not None:
+            lens = cameras.read_camera(calibration, files.camera)
+        else:
+            with suppress(InputError):  # label maps need no calibration
+                lens = files.read_camera(files.calibration)
+        found.append((folder, files.frames, lens))
+    return found
 
 
 def _mask_settings(options: Any, has_labels: bool = True) -> Any:

@@ -132,8 +132,15 @@ SHARED: dict[str, dict[str, Any]] = {
         metavar="N",
         help="fill each of 16 x 5 fields of the frame to N keypoints where the mask leaves fewer",
     ),
+    "--calibration": dict(
+        type=path,
+        metavar="FILE",
+        help="camera with distortion, which is taken out: fx fy cx cy k1 k2 p1 p2 (the first four are enough), a "
+        "camera matrix, or YAML of OpenCV, ROS, EuRoC, Kalibr, OKVIS, VINS-Fusion or ORB-SLAM (that of the "
+        "layout, such as calib.txt)",
+    ),
 }
-SEQUENCE = ("--kitti", "--sequence", "--camera", "--frames")
+SEQUENCE = ("--kitti", "--sequence", "--camera", "--calibration", "--frames")
 DILATION = dict(type=int, metavar="W", help="dilation width, in pixels, of masks from label maps")
 
 MASK_OPTIONS: dict[str, Any] = {
@@ -221,6 +228,7 @@ COMMANDS: dict[str, dict[str, Any]] = {
             metavar="DIR",
             help="folder of PNG or JPEG images, one sequence, or a folder of sequences, which get a subfolder each",
         ),
+        **_shared("--calibration"),
         "--model": dict(
             type=path,
             metavar="FILE",
@@ -255,14 +263,17 @@ COMMANDS: dict[str, dict[str, Any]] = {
             help="true camera-to-world poses in KITTI's, TUM's or EuRoC's format (poses/NN.txt, or poses.txt "
             "beside the frames)",
         ),
-        "--calibration": dict(
-            type=path,
-            metavar="FILE",
-            help="camera with distortion, which is taken out: fx fy cx cy k1 k2 p1 p2 (the first four are "
-            "enough), or YAML of OpenCV, ROS, EuRoC, Kalibr or ORB-SLAM (calib.txt, without distortion)",
+        "--truth-within": dict(
+            type=float,
+            metavar="SECONDS",
+            default=0.01,
+            help="a frame gets the true pose that is nearest in time, at most so far; frames without one are left "
+            "out (0.01, as in evo)",
         ),
         "--speed": dict(
-            type=float, metavar="M_PER_S", help="speed, if there is no ground truth (1 m a frame)"
+            type=float,
+            metavar="M_PER_S",
+            help="speed, in place of ground truth (without both, 1 m a frame)",
         ),
         "--fps": dict(
             type=float, metavar="N", help="frames a second, if there is no times.txt (10)"

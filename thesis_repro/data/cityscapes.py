@@ -10,6 +10,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from thesis_repro.data.cameras import Camera, undistorted
 from thesis_repro.data.frames import eight_bits
 from thesis_repro.errors import InputError
 from thesis_repro.running.files import listed, progress, read_color, read_gray, read_ids
@@ -149,14 +150,22 @@ def _by_name(folder: Path, pattern: str, ending: str) -> dict[str, Path]:
 
 
 def read_image(
-    path: str | Path, height: int, width: int, channels: int = 1, white: int = 0
+    path: str | Path,
+    height: int,
+    width: int,
+    channels: int = 1,
+    white: int = 0,
+    lens: Camera | None = None,
 ) -> np.ndarray:
     """Read an image and resize it bilinearly (A.2.1): uint8 (height, width, channels).
 
     channels: 1 for gray, as in the thesis; 3 for red, green, blue. white: see `frames.white_level`.
+    lens: whose distortion is taken out.
     """
     read = read_gray if channels == 1 else read_color
     image = eight_bits(read(path, np.uint16 if white else np.uint8), white)
+    if lens is not None:
+        image = undistorted(image, lens)
     image = resize_bilinear(image, (height, width))
     return image.reshape(height, width, channels)
 

@@ -18,8 +18,15 @@ from thesis_repro.running import program
 from thesis_repro.running.files import images, read_gray
 
 DECIMAL = re.compile(r"\d+\.\d+")  # names of frames that may be seconds
-# names that are times since 1970, and their unit in seconds
-EPOCH_NAMES = {r"1\d{18}": 1e-9, r"1\d{9}\.\d{6}": 1, r"1\d{9}\.\d{9}": 1}
+# Times since 1970 in names, with words before or after, and their unit in seconds. Of two numbers,
+# the second one has 3 or 6 decimals in all names, or is nanoseconds without leading zeros.
+EPOCH_NAMES = {
+    r"1\d{18}": 1e-9,
+    r"1\d{15}": 1e-6,
+    r"1\d{12}": 1e-3,
+    r"1\d{9}\.(?:\d{3}|\d{6}|\d{9})": 1,
+    r"1\d{9}[_-]\d{1,9}": 1,
+}
 MAX_KINDS = 4  # of pictures in one folder; hexadecimal numbers look like more
 SHARED_NUMBERS = 0.6  # numbers a frame, or fewer, if most frames are there twice
 # A 16-bit frame has hot pixels if its maximum is HOT times what all but 0.1 % stay below.
@@ -30,9 +37,9 @@ FEW_LEVELS = 32  # of 256
 class Files(NamedTuple):
     """What a layout finds in the folder of a sequence. All but the frames may be missing.
 
-    frames: in their order. read_poses: a function of `poses` and of the times, as
-    `trajectories.read_truth`. others: what the poses are made from as well. doubts: lines that say
-    what may be wrong.
+    frames: in their order. read_poses: a function of `poses`, the times and the largest difference
+    of times, as `trajectories.read_truth`. others: what the poses are made from as well. doubts:
+    lines that say what may be wrong. camera: name of the camera's folder.
     """
 
     frames: list[Path]
@@ -41,9 +48,10 @@ class Files(NamedTuple):
     times: Path
     poses: Path
     read_times: Callable[[Path], np.ndarray] = read_times
-    read_poses: Callable[[Path, np.ndarray], tuple] = read_truth
+    read_poses: Callable[[Path, np.ndarray | None, float], tuple] = read_truth
     others: tuple[Path, ...] = ()
     doubts: Callable[[], list[str]] = list
+    camera: str = ""
 
 
 def camera_folder(
@@ -128,10 +136,18 @@ def _may_be_nanoseconds(ordered: list[Path], fractions: list[str]) -> bool:
 
 
 def times_in_names(paths: list[Path]) -> np.ndarray | None:
-    """Times of frames, (n,), seconds, if their names are nanoseconds or seconds since 1970."""
+    """Times of frames, (n,), seconds, if their names hold times since 1970 that increase."""
     for form, unit in EPOCH_NAMES.items():
-        if all(re.fullmatch(form, path.stem) for path in paths):
-            return unit * np.array([path.stem for path in paths], np.float64)
+        found = [re.fullmatch(rf"(?:.*\D)??({form})(?:\D.*)?", path.stem) for path in paths]
+        if not all(found):
+            continue
+        words = [re.split("[_-]", match[1]) for match in found if match]
+        times = unit * np.array([word[0] for word in words], np.float64)
+        if len(words[0]) > 1:
+            digits = {len(word[1]) for word in words}
+            decimals = digits.pop() if digits in ({3}, {6}) else 9
+            times += 10.0**-decimals * np.array([word[1] for word in words], np.float64)
+        return times if (np.diff(times) > 0).all() else None
     return None
 
 

@@ -3,7 +3,7 @@
 import operator
 from collections.abc import Callable, Iterator
 from copy import copy
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 
 import cv2
@@ -13,7 +13,7 @@ from thesis_repro.data import cameras, layout
 from thesis_repro.data.frames import eight_bits, say_once, times_in_names, white_level
 from thesis_repro.data.geometry import CAMERAS, check_camera
 from thesis_repro.data.memory import FRAME_TIME, ArraySequence, distances, step_lengths
-from thesis_repro.data.trajectories import read_truth
+from thesis_repro.data.trajectories import WITHIN, read_truth
 from thesis_repro.errors import InputError
 from thesis_repro.running import provenance
 from thesis_repro.running.files import read_gray, read_unchanged
@@ -82,42 +82,54 @@ class Sequence:
         fps: float | None = None,
         truth: str | Path | None = None,
         calibration: str | Path | None = None,
+        truth_within: float = WITHIN,
     ) -> None:
         """Find, read and check the files of a sequence, except its frames.
 
         root: folder that holds sequences and poses. name: the sequence, "06", "6" or 6.
         For a sequence outside of a root, root is None and name is a folder.
         camera: one of the layout's, such as image_2; the default is the left one. speed: metres a
-        second, for a sequence without ground truth; the default is one metre a frame. fps: frames a
+        second, in place of ground truth; without both, a step is a metre. fps: frames a
         second, for a sequence without a file of times. truth: file of the ground truth, in any form
         that poses.txt may have. calibration: file of a camera, see `cameras.read_camera`; its
-        distortion is taken out of the frames.
+        distortion is taken out of the frames. truth_within: seconds between a frame and its pose,
+        at most, if poses have times. Frames without a pose are left out.
         """
         self.folder = layout.locate(root, name)
         self.name, self.speed = self.folder.name, speed
         self.border: np.ndarray | None = None  # see `without_border`
         files = layout.files(self.folder, camera)
+        own_calibration = files.calibration
         if calibration is not None:
-            files = files._replace(read_camera=cameras.read_camera, calibration=Path(calibration))
+            read_camera = partial(cameras.read_camera, name=files.camera)
+            files = files._replace(read_camera=read_camera, calibration=Path(calibration))
         if truth is not None:
             files = files._replace(read_poses=read_truth, poses=Path(truth))
         self.frame_paths, self.doubts, self._others = files.frames, files.doubts, files.others
         self.calibration_path = files.calibration
         self.times_path, self.poses_path = files.times, files.poses
         lens = files.read_camera(self.calibration_path)
+        self.lens = lens
         self.intrinsics, self.distortion, self.stated_size = lens[:3]
-        self.has_times = self.times_path.exists()
+        self._body, self._body_path = lens.body, self.calibration_path
+        if lens.body is None:  # another calibration leaves T_BS as it is
+            self._body, self._body_path = cameras.read_body(own_calibration), own_calibration
+            self._others += (own_calibration,) if self._body is not None else ()
+        # whether somebody said what they are
+        self.has_times = self.times_path.exists() or fps is not None
         self.times = self._read_times(files.read_times, fps)
-        self.has_truth = truth is not None or self.poses_path.exists()
+        self.usual_interval = float(np.median(np.diff(self.times))) if len(self) > 1 else 0.0
+        self.has_truth = truth is not None or (speed is None and self.poses_path.exists())
         if self.has_truth:
-            indices, poses = files.read_poses(self.poses_path, self.times)
-            self._take_truth(indices, poses, lens.body)
+            times = self.times if self.has_times else None
+            indices, poses = files.read_poses(self.poses_path, times, truth_within)
+            self._take_truth(indices, poses, truth_within)
         if speed is not None:
-            self._check_speed(speed, self.has_times or fps is not None)
+            self._check_speed(speed)
 
     def _read_times(self, read: Callable[[Path], np.ndarray], fps: float | None) -> np.ndarray:
         path = self.times_path
-        if self.has_times:
+        if path.exists():
             if fps is not None:
                 raise InputError(f"fps {fps:g}: leave it out; {path} has the times of the frames")
             times = read(path)
@@ -140,40 +152,51 @@ class Sequence:
         )
         return FRAME_TIME * np.arange(len(self))
 
-    def _take_truth(
-        self, indices: np.ndarray | None, poses: np.ndarray, body: np.ndarray | None
-    ) -> None:
-        """Take poses of the frames with these indices; None: of all frames.
+    def _take_truth(self, indices: np.ndarray | None, poses: np.ndarray, within: float) -> None:
+        """Take poses of the frames with these indices, and leave out the others; None: all frames.
 
-        Frames before and after them are left out. body: the camera's pose in the body, whose poses
-        EuRoC's files hold.
+        EuRoC's files (.csv) hold those of a body, others the camera's.
         """
         self._poses, path = poses, self.poses_path
+        if path.suffix == ".csv" and self._body is not None:
+            self._poses = poses @ self._body
+            say_once(f"{path}: poses of the body become the camera's by T_BS of {self._body_path}")
+        elif path.suffix == ".csv":
+            say_once(
+                f"{path}: holds poses of a body, which are taken as the camera's, because {self._body_path} "
+                "has no T_BS, the camera's pose in the body",
+                warns=True,
+            )
+        elif self._body is not None:
+            say_once(
+                f"{path}: poses are taken as the camera's; if they are those of the body that {self._body_path} "
+                "knows (T_BS), give EuRoC's .csv"
+            )
         if indices is None:
             check_count(path, len(poses), self.frame_paths)
             return
-        if body is not None and path.suffix == ".csv":
-            self._poses = poses @ body
-            say_once(
-                f"{path}: poses of the body become the camera's by T_BS of {self.calibration_path}"
+        inner = np.setdiff1d(np.arange(indices[0], indices[-1] + 1), indices)
+        line = f"{path}: has poses of {len(indices)} of {len(self)} frames, which are used"
+        if len(inner):
+            line += (
+                f"; {len(inner)} between them, the first one {self.frame_paths[inner[0]].name}, have none "
+                f"within {within:g} s"
             )
-        first, end = indices[0], indices[-1] + 1
-        gaps = np.setdiff1d(np.arange(first, end), indices)
-        if len(gaps):
-            raise InputError(f"{path}: {self.frame_paths[gaps[0]].name} has no pose within 0.01 s")
         if len(indices) < len(self):
-            say_once(f"{path}: has poses of {len(indices)} of {len(self)} frames, which are used")
-        self.frame_paths = self.frame_paths[first:end]
-        self.times = self.times[first:end]
+            say_once(line)
+        self.frame_paths = [self.frame_paths[index] for index in indices]
+        self.times = self.times[indices]
 
-    def _check_speed(self, speed: float, has_times: bool) -> None:
+    def _check_speed(self, speed: float) -> None:
         if not 0 < speed < np.inf:
             raise InputError(f"speed {speed:g}: must be a number of metres a second, above 0")
         if self.has_truth:
             raise InputError(
                 f"speed {speed}: leave it out; {self.poses_path} has the true step lengths"
             )
-        if not has_times:
+        if self.poses_path.exists():
+            say_once(f"{self.poses_path}: true poses are not used, because of the speed")
+        if not self.has_times:
             raise InputError(
                 f"speed {speed}: needs the times of the frames (times.txt), or their number a second "
                 "(--fps)"
@@ -244,16 +267,7 @@ class Sequence:
 
     def undistorted(self, image: np.ndarray) -> np.ndarray:
         """Image of the frame's size without the camera's distortion; frames are so already."""
-        if not self.distortion.any():
-            return image
-        return cv2.remap(image, *self._maps, cv2.INTER_LINEAR)
-
-    @cached_property
-    def _maps(self) -> tuple[np.ndarray, np.ndarray]:
-        camera, size = self.intrinsics, self.size[::-1]
-        return cv2.initUndistortRectifyMap(
-            camera, self.distortion, None, camera, size, cv2.CV_16SC2
-        )
+        return cameras.undistorted(image, self.lens)
 
     def __getitem__(self, index: int) -> np.ndarray:
         return self.frame(operator.index(index))

@@ -49,6 +49,7 @@ def files(folder: Path, camera: str | None) -> Files:
         folder / "times.txt",
         poses(folder),
         read_poses=partial(_read_poses, calibration=calibration, key=key),
+        camera=image_folder.name,
     )
 
 
@@ -69,8 +70,10 @@ def _projection(path: Path, key: str) -> np.ndarray:
     return projection
 
 
-def _read_poses(path: Path, times: np.ndarray, calibration: Path, key: str) -> tuple:
-    indices, found = read_truth(path, times)
+def _read_poses(
+    path: Path, times: np.ndarray | None, within: float, calibration: Path, key: str
+) -> tuple:
+    indices, found = read_truth(path, times, within)
     return indices, moved(found, calibration, key)
 
 

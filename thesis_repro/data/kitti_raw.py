@@ -54,6 +54,7 @@ def files(folder: Path, camera: str | None) -> Files:
         partial(_read_truth, key=key),
         (*used, *_measurements(folder)),
         partial(_doubts, folder),
+        image_folder.parent.name,
     )
 
 
@@ -79,7 +80,7 @@ def _doubts(folder: Path) -> list[str]:
     ]
 
 
-def _read_truth(path: Path, times: np.ndarray, key: str) -> tuple:
+def _read_truth(path: Path, times: np.ndarray, within: float, key: str) -> tuple:
     """Read the poses of all frames, as `trajectories.read_truth` does."""
     folder = path.parent.parent
     return None, kitti_odometry.moved(read_poses(folder), calibration(folder), key)

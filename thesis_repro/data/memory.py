@@ -8,8 +8,11 @@ import numpy as np
 
 from thesis_repro.data.geometry import are_poses
 from thesis_repro.errors import InputError
+from thesis_repro.running import program
 
 FRAME_TIME = 0.1  # seconds between frames, where nobody says when they were taken
+# What drives stays below them; KITTI's car reaches 2.8 m a frame and 26 m/s.
+MAX_STEP, MAX_SPEED = 50.0, 100.0  # metres a frame, metres a second
 
 
 class SequenceLike(Protocol):
@@ -75,6 +78,8 @@ class ArraySequence:
         self._frames, self.intrinsics = frames, np.array(intrinsics, float)
         self.name = self.poses_path = name
         self.times = _numbers("times", times, FRAME_TIME * np.arange(len(frames)))
+        if not (np.diff(self.times) > 0).all():
+            raise InputError("times: must increase from frame to frame, seconds")
         self.scales = _numbers("scales", scales, step_lengths(self.times, speed))
         self.has_truth = poses is not None
         if self.has_truth:
@@ -82,6 +87,13 @@ class ArraySequence:
             if not are_poses(self._poses).all():
                 raise InputError("poses: must be camera to world, a rotation and a position each")
             self.scales = distances(self._poses)
+        impossible = are_impossible(self.scales[1:], None if times is None else np.diff(self.times))
+        if impossible.any():
+            program.log.warning(
+                f"{name}: {impossible.sum()} of {len(frames) - 1} steps are impossible; the first is "
+                f"{self.scales[1:][impossible][0]:.3g} m; are lengths in metres, times in seconds, and the "
+                "speed in metres a second?"
+            )
 
     @property
     def poses(self) -> np.ndarray:
@@ -136,6 +148,15 @@ def step_lengths(times: np.ndarray, speed: float | None) -> np.ndarray:
     if speed is not None:
         lengths = speed * np.diff(times)
     return np.array([0.0, *lengths])
+
+
+def are_impossible(lengths: np.ndarray, intervals: np.ndarray | None) -> np.ndarray:
+    """Whether steps, (n,), metres, are longer or faster than what drives.
+
+    intervals: seconds, (n,); None if nobody stated them.
+    """
+    impossible = lengths > MAX_STEP
+    return impossible if intervals is None else impossible | (lengths > MAX_SPEED * intervals)
 
 
 def _numbers(name: str, values: Any, default: np.ndarray) -> np.ndarray:

@@ -10,6 +10,7 @@ from thesis_repro.errors import InputError
 from thesis_repro.running.files import write_text
 
 QUATERNION_TOLERANCE = 0.01  # of their length; files have few digits
+WITHIN = 0.01  # seconds between a frame and its pose, evo's limit; TUM's own tool takes 0.02
 # {data set: Python that writes a file of its poses for `read_poses`}
 CONVERSIONS = {
     "Virtual KITTI 2": (
@@ -130,15 +131,23 @@ def read_poses(path: str | Path) -> np.ndarray:
     return poses
 
 
-def read_truth(path: Path, times: np.ndarray) -> tuple[np.ndarray | None, np.ndarray]:
+def read_truth(
+    path: Path, times: np.ndarray | None, within: float = WITHIN
+) -> tuple[np.ndarray | None, np.ndarray]:
     """Read a file of poses in any of the formats.
 
-    times: of the frames, (n,), seconds. Returns as `read_poses_at`; without times in the file, None
-    and a pose a line.
+    times: of the frames, (n,), seconds; None if nobody stated them. Returns as `read_poses_at`;
+    without times in the file, None and a pose a line. Raises InputError for a file with times and
+    frames without.
     """
-    if have_times(path):
-        return read_poses_at(path, times)
-    return None, read_poses(path)
+    if not have_times(path):
+        return None, read_poses(path)
+    if times is None:
+        raise InputError(
+            f"{path}: belongs to the frames by its times, but nothing states those of the frames; give their "
+            "number a second (--fps), or write times.txt, seconds, a line a frame"
+        )
+    return read_poses_at(path, times, within)
 
 
 def have_times(path: Path) -> bool:
@@ -147,29 +156,38 @@ def have_times(path: Path) -> bool:
     return path.suffix == ".csv" or bool(lines and len(lines[0].split()) == 8)
 
 
-def read_poses_at(path: Path, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def read_poses_at(
+    path: Path, times: np.ndarray, within: float = WITHIN
+) -> tuple[np.ndarray, np.ndarray]:
     """Poses of the frames at times (n,), seconds, from a file in TUM's or EuRoC's format.
 
-    Returns the indices of the frames that have a pose within 0.01 seconds, (m,), and their poses,
-    (m, 4, 4), as evo associates them. Raises InputError if there are none, or for a malformed file.
+    A frame has the pose that is nearest in time, as evo associates them, and each pose is that of
+    one frame. within: largest difference, seconds. Returns the indices of the frames that have a
+    pose, (m,), and their poses, (m, 4, 4). Raises InputError if there are none, or for a malformed
+    file.
     """
     # these take 0.4 s to load
     from evo import EvoException
-    from evo.core.sync import associate_trajectories
+    from evo.core.sync import SyncException, associate_trajectories
     from evo.core.trajectory import PoseTrajectory3D
     from evo.tools import file_interface
 
     nowhere = np.zeros((len(times), 3)), np.tile([1.0, 0, 0, 0], (len(times), 1))
-    frames = PoseTrajectory3D(
-        *nowhere, times.astype(float), name=f"the times of the frames of {path.parent}"
-    )
+    frames = PoseTrajectory3D(*nowhere, times.astype(float))
     lines = [" ".join(line.split()) for line in read_text(path).splitlines()]
     file = io.StringIO("\n".join(filter(None, lines)))
     read = file_interface.read_tum_trajectory_file
     if path.suffix == ".csv":
         read = file_interface.read_euroc_csv_trajectory
     try:
-        frames, truth = associate_trajectories(frames, read(file))
+        truth = read(file)
+        frames, truth = associate_trajectories(frames, truth, max_diff=within)
+    except SyncException:
+        ends = [f"{of[0]:.15g} to {of[-1]:.15g}" for of in (truth.timestamps, times)]
+        raise InputError(
+            f"{path}: no pose is within {within:g} s of a frame; its poses have the times {ends[0]}, the frames "
+            f"{ends[1]}, seconds"
+        ) from None
     except (EvoException, ValueError) as error:
         raise InputError(f"{path}: {error}") from None
     poses = np.array(truth.poses_se3)
@@ -179,8 +197,12 @@ def read_poses_at(path: Path, times: np.ndarray) -> tuple[np.ndarray, np.ndarray
             f"{path}: must hold finite positions and quaternions of length 1, not of {norms.min():g} to "
             f"{norms.max():g}"
         )
-    indices, first = np.unique(np.searchsorted(times, frames.timestamps), return_index=True)
-    return indices, poses[first]
+    # evo gives a frame several poses where these are fewer than the frames, but closer together
+    nearest = np.abs(frames.timestamps - truth.timestamps).argsort(kind="stable")
+    for stamps in (frames.timestamps, truth.timestamps):
+        nearest = nearest[np.sort(np.unique(stamps[nearest], return_index=True)[1])]
+    nearest = nearest[frames.timestamps[nearest].argsort()]
+    return np.searchsorted(times, frames.timestamps[nearest]), poses[nearest]
 
 
 def write_kitti_poses(path: str | Path, poses: np.ndarray) -> None:

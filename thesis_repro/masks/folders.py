@@ -10,6 +10,8 @@ import cv2
 import numpy as np
 
 from thesis_repro.data import label_ids
+from thesis_repro.data.cameras import Camera
+from thesis_repro.data.frames import say_once
 from thesis_repro.data.kitti import Sequence, check_size
 from thesis_repro.errors import InputError
 from thesis_repro.masks import (
@@ -193,6 +195,7 @@ def _label_map_paths(folder: str | Path, sequence: Sequence) -> list[Path]:
 def _mask_paths(folder: str | Path, sequence: Sequence) -> list[Path]:
     """One path a frame to its mask. Raises InputError if one is missing."""
     if Path(folder).is_file():
+        _check_lens(Path(folder), sequence, "mask")
         return [Path(folder)] * len(sequence)
     _check_format(Path(folder))
     place = _existing_folder(folder, sequence, "mask")
@@ -213,18 +216,31 @@ def _existing_folder(folder: str | Path, sequence: Sequence, kind: str) -> Path:
             f"{folder}: the frames are not in files, so no {kind} belongs to them; give masks as a "
             "list, one a frame"
         )
-    if sequence.distortion.any():
-        raise InputError(
-            f"{folder}: {kind}s of raw frames do not fit frames without distortion; undistort the frames "
-            "before their label maps are made, and leave out --calibration"
-        )
     place = folder_of_sequence(folder, sequence.name)
     if not place.is_dir():
         raise InputError(
             f"{place}: no such folder; it must hold one {kind} for each frame of sequence "
             f"{sequence.name}"
         )
+    _check_lens(place, sequence, kind)
     return place
+
+
+def _check_lens(place: Path, sequence: Sequence, kind: str) -> None:
+    """Say of which frames masks must be, and raise InputError if `predict` made them of others.
+
+    They live in frames without distortion, as the odometry sees them.
+    """
+    lens, made = getattr(sequence, "lens", Camera(np.eye(3), np.empty(0))), provenance.record(place)
+    if made and "model" in made and made.get("camera", []) != lens.record():
+        raise InputError(
+            f"{place}: made of frames with other distortion than the odometry sees; make them again, by "
+            "predict with --images SEQUENCE, and --calibration if the odometry gets one"
+        )
+    if lens.record():
+        say_once(
+            f"{place}: {kind}s must be of frames without distortion, as predict and tr.Sequence make them"
+        )
 
 
 def _by_frame(folder: Path, present: dict[str, Path], sequence: Sequence, kind: str) -> list[Path]:

@@ -5,7 +5,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from thesis_repro.data.geometry import are_poses, check_camera, is_camera_matrix
+from thesis_repro.data.frames import say_once
+from thesis_repro.data.geometry import are_poses, centre_doubt, check_camera, is_camera_matrix
 from thesis_repro.errors import InputError
 from thesis_repro.odometry.settings import THESIS
 from thesis_repro.running import program
@@ -48,6 +49,8 @@ def gray_frame(
             "the odometry needs 8-bit gray, (height, width)"
         )
     check_camera("intrinsics", intrinsics, f"frame {number}", frame.shape)
+    if previous is None and (doubt := centre_doubt(intrinsics, frame.shape)):
+        say_once(f"intrinsics: {doubt}", warns=True)
     if previous is not None and frame.shape != previous.shape:
         raise InputError(
             f"frame {number}: shape {frame.shape}, earlier frames {previous.shape}; "

@@ -190,6 +190,8 @@ def step_errors(estimated: np.ndarray, true: np.ndarray) -> dict[str, float]:
 FOREIGN_DIRECTION, EXPLAINED = 45.0, 15.0  # degrees; 5.9 is the largest of healthy recorded runs
 BETTER = 0.25  # share of the errors' product that the right convention leaves
 MIN_STEPS = 10  # of a path, to say what its poses are
+CHECKED_LENGTH = MIN_STEPS * MIN_DIRECTED_STEP  # metres of a path that has so many
+TURNING = 3.0  # degrees, of a path in which poses without rotations do not fit
 OPENGL = np.diag([1.0, -1, -1, 1])
 
 
@@ -222,6 +224,8 @@ CONVENTIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "are in reverse order": lambda poses: poses[::-1],
 }
 TURNED = "are those of a body with other axes; the camera's are x right, y down, z forward"
+NO_ROTATION = 1e-3  # degrees
+NO_ROTATIONS = "poses have no rotations (all are equal), so neither their axes nor errors of rotation can be judged"
 UNKNOWN = "do not fit these frames, or the odometry fails on them"
 
 
@@ -232,20 +236,29 @@ def foreign_poses(poses: np.ndarray, reference: np.ndarray) -> str:
     an estimate and the first ones the ground truth. No working odometry is off by FOREIGN_DIRECTION
     degrees in the median direction of its steps, and no one of CONVENTIONS leaves less than BETTER
     of the product of right poses' errors in direction and rotation. Only steps of MIN_DIRECTED_STEP
-    or more count.
+    or more count, over several frames where those from frame to frame are shorter.
     """
-    given = _misfit(poses, reference)
+    turns = [angles(np.linalg.inv(path[0]) @ path).max() for path in (poses, reference)]
+    chosen = list(range(len(poses)))
+    if len(_steps_to_compare(poses, reference)[0]) < MIN_STEPS:
+        chosen = _distant(reference)
+    reference = reference[chosen]
+    given = _misfit(poses[chosen], reference)
+    if turns[0] < NO_ROTATION and (turns[1] > TURNING or given[0] > FOREIGN_DIRECTION):
+        return NO_ROTATIONS
     kind, limits, product = "", given, BETTER * given.prod()  # NaN for too few steps
     if given[0] > FOREIGN_DIRECTION:
         kind, limits, product = UNKNOWN, np.array([EXPLAINED, np.inf]), np.inf
-    misfits = {text: _misfit(changed(poses), reference) for text, changed in CONVENTIONS.items()}
+    misfits = {
+        text: _misfit(changed(poses)[chosen], reference) for text, changed in CONVENTIONS.items()
+    }
     fitting = {
         text: misfit.prod()
         for text, misfit in misfits.items()
         if (misfit < limits).all() and misfit.prod() < product
     }
     if kind:
-        misfit = _misfit(_turned(poses, reference), reference)
+        misfit = _misfit(_turned(poses[chosen], reference), reference)
         if misfit[0] < EXPLAINED:  # a rotation that is fitted explains the others as well
             fitting[TURNED] = misfit.prod() / BETTER
     if fitting:
@@ -256,6 +269,15 @@ def foreign_poses(poses: np.ndarray, reference: np.ndarray) -> str:
         f"steps point {given[0]:.0f} degrees (median) elsewhere and turn by {given[1]:.2g} (mean) otherwise, "
         f"so these poses most likely {kind}"
     )
+
+
+def _distant(poses: np.ndarray) -> list[int]:
+    """Indices of poses (n, 4, 4), each MIN_DIRECTED_STEP or more from the one before."""
+    found = [0]
+    for index, pose in enumerate(poses):
+        if np.linalg.norm(pose[:3, 3] - poses[found[-1], :3, 3]) >= MIN_DIRECTED_STEP:
+            found.append(index)
+    return found
 
 
 def _steps_to_compare(poses: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -14,6 +14,7 @@ from thesis_repro.odometry.inputs import EQUAL
 from thesis_repro.odometry.loop import STATIONARY, Calls, Odometry
 from thesis_repro.odometry.settings import THESIS, OdometrySettings
 from thesis_repro.odometry.step import FRAME_COLUMNS, ROTATION_COLUMNS, TIMED_PARTS, Step
+from thesis_repro.running import program
 from thesis_repro.running.files import progress
 
 # Frames from which faster calls with OpenCV's bits pay. To load them takes 2 s, to compile 25 s;
@@ -209,6 +210,11 @@ def check(sequence: Any, masks: Any) -> None:
     is_short = isinstance(masks, Sized) and len(masks) < len(sequence)
     if is_short or not isinstance(masks, Masks | None):
         raise InputError(f"masks: must be {len(sequence)} masks, one a frame, such as LabelMasks")
+    if isinstance(masks, Sized) and len(masks) > len(sequence):
+        program.log.warning(
+            f"masks: {len(masks)} for {len(sequence)} frames; the first ones are taken, so they must belong "
+            "to the same first frame"
+        )
 
 
 def _result(rows: list[list], settings: OdometrySettings, steps: Sequence[Step] = ()) -> Result:

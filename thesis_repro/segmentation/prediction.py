@@ -11,6 +11,7 @@ import numpy as np
 import tensorflow as tf
 
 from thesis_repro import segmentation
+from thesis_repro.data.cameras import Camera
 from thesis_repro.data.cityscapes import read_image
 from thesis_repro.data.frames import white_level
 from thesis_repro.errors import InputError
@@ -54,12 +55,14 @@ def write_label_maps(
     output_dir: str | Path,
     batch_size: int = 16,
     scale: float = 1.0,
+    lens: Camera | None = None,
 ) -> int:
     """Write the label map of each image as output_dir/NAME.png (A.7.2).
 
     Label maps are 320x320 pixels of 8 bits; they hold the ids of the model's classes, which are
     Cityscapes ids for the thesis's network. Images of any size are stretched to the model's input,
-    as in the appendix. scale: as in `predict`.
+    as in the appendix. scale: as in `predict`. lens: of the camera; they are made of frames without
+    its distortion, as the odometry sees them.
     A killed run resumes: complete batches are skipped, and of an incomplete batch all images are
     predicted again, because the bits depend on the batch, but only missing files are written. The
     folder is a stage (see provenance): label maps of another model or of other images in it are
@@ -87,6 +90,8 @@ def write_label_maps(
         }
         if scale != 1:
             inputs["scale"] = scale
+        if lens is not None and (made_for := lens.record()):
+            inputs["camera"] = made_for
         provenance.stage(folder, **inputs)
         pairs = [(path, folder / name) for path, name in zip(paths, names)]
         batches = [pairs[start : start + batch_size] for start in range(0, len(pairs), batch_size)]
@@ -99,7 +104,7 @@ def write_label_maps(
         with bar, ThreadPoolExecutor() as pool:
             for batch in batches:
                 images = pool.map(
-                    lambda pair: read_image(pair[0], height, width, channels, white), batch
+                    lambda pair: read_image(pair[0], height, width, channels, white, lens), batch
                 )
                 label_maps = run(np.stack(list(images)))
                 list(pool.map(_write, batch, label_maps))

@@ -1,0 +1,316 @@
+"""EuRoC and TUM RGB-D as the data sets have them: distortion, T_BS, times and gaps of the truth.
+
+A rendered street, seen through the lenses of both. What is right is computed by evo and OpenCV
+alone.
+"""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+from evo.core.metrics import PoseRelation
+from evo.core.sync import associate_trajectories
+from evo.core.trajectory import PoseTrajectory3D
+from evo.main_ape import ape
+from evo.tools import file_interface
+from scipy.spatial.transform import Rotation, Slerp
+from street import Street
+
+from thesis_repro.command.cli import main
+from thesis_repro.data import kitti, trajectories
+from thesis_repro.errors import InputError
+from thesis_repro.masks.folders import LabelMasks, MaskFolder
+from thesis_repro.segmentation import prediction
+
+COUNT = 30
+LENSES = {
+    "euroc": [-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05],
+    "tum": [0.2624, -0.9531, -0.0054, 0.0026, 1.1633],
+}
+T_BS = np.array(  # of EuRoC's left camera
+    [
+        [0.0148655429818, -0.999880929698, 0.00414029679422, -0.0216401454975],
+        [0.999557249008, 0.0149672133247, 0.025715529948, -0.064676986768],
+        [-0.0257744366974, 0.00375618835797, 0.999660727178, 0.00981073058949],
+        [0.0, 0.0, 0.0, 1.0],
+    ]
+)
+START_NS = 1403715273262142976
+
+
+def seen_through(image, camera, distortion):
+    """Image as a lens shows it: without its distortion, it is the image again."""
+    height, width = image.shape
+    pixels = np.mgrid[:height, :width][::-1].reshape(2, -1).T.astype(float)[:, None]
+    precise = 3, 100, 1e-9
+    straight = cv2.undistortPointsIter(pixels, camera, np.array(distortion), None, camera, precise)
+    u, v = np.float32(straight[:, 0]).T.reshape(2, height, width)
+    return cv2.remap(image, u, v, cv2.INTER_CUBIC)
+
+
+def between(poses, times, wanted):
+    """Poses at other times."""
+    made = np.tile(np.eye(4), (len(wanted), 1, 1))
+    for axis in range(3):
+        made[:, axis, 3] = np.interp(wanted, times, poses[:, axis, 3])
+    made[:, :3, :3] = Slerp(times, Rotation.from_matrix(poses[:, :3, :3]))(wanted).as_matrix()
+    return made
+
+
+@pytest.fixture(scope="module")
+def drives(tmp_path_factory):
+    """A street in both layouts, {name: folder}."""
+    root, street = tmp_path_factory.mktemp("drives"), Street(COUNT)
+    camera = street.intrinsics
+    (fx, _, cx), (_, fy, cy), _ = camera.tolist()
+    world = np.eye(4)  # z up, as the data sets have it
+    world[:3] = [[0, 0, 1, 2], [-1, 0, 0, -1], [0, -1, 0, 1.5]]
+    true = world @ street.poses
+    # EuRoC: 20 frames a second, 200 poses of the body, which begin later and end earlier
+    stamps = START_NS + 50_000_000 * np.arange(COUNT)
+    data = root / "MH_01/mav0/cam0/data"
+    data.mkdir(parents=True)
+    for stamp, image in zip(stamps, street.images):
+        cv2.imwrite(str(data / f"{stamp}.png"), seen_through(image, camera, LENSES["euroc"]))
+    lines = "".join(f"{stamp},{stamp}.png\r\n" for stamp in stamps)
+    (data.parent / "data.csv").write_text(f"#timestamp [ns],filename\r\n{lines}")
+    (data.parent / "sensor.yaml").write_text(
+        f"sensor_type: camera\nT_BS:\n  cols: 4\n  rows: 4\n  data: {T_BS.ravel().tolist()}\n"
+        f"rate_hz: 20\nresolution: [480, 160]\ncamera_model: pinhole\n"
+        f"intrinsics: [{fx}, {fy}, {cx}, {cy}] #fu, fv, cu, cv\n"
+        "distortion_model: radial-tangential\n"
+        f"distortion_coefficients: {LENSES['euroc']}\n"
+    )
+    seconds = 0.05 * np.arange(COUNT)
+    at = np.arange(0.1021, 1.3, 0.005)
+    body = between(true @ np.linalg.inv(T_BS), seconds, at)
+    quaternions = Rotation.from_matrix(body[:, :3, :3]).as_quat()[:, [3, 0, 1, 2]]
+    rows = [
+        f"{START_NS + round(1e9 * time)}," + ",".join(f"{number:.6f}" for number in numbers)
+        for time, numbers in zip(at, np.column_stack([body[:, :3, 3], quaternions]))
+    ]
+    truth = root / "MH_01/mav0/state_groundtruth_estimate0/data.csv"
+    truth.parent.mkdir()
+    truth.write_text("\n".join(["#timestamp, p_RS_R_x [m], p_RS_R_y [m]", *rows, ""]))
+    # TUM: 30 frames a second, 100 poses of the camera, with two gaps of 0.11 s
+    folder = root / "rgbd_dataset_freiburg1_street"
+    (folder / "rgb").mkdir(parents=True)
+    seconds = 1305031102.175304 + np.arange(COUNT) / 30
+    listed = []
+    for second, image in zip(seconds, street.images):
+        listed.append(f"{second:.6f} rgb/{second:.6f}.png\n")
+        pixels = seen_through(image, camera, LENSES["tum"])
+        cv2.imwrite(str(folder / listed[-1].split()[1]), cv2.merge([pixels] * 3))
+    (folder / "rgb.txt").write_text("# color images\n# file: 'x.bag'\n" + "".join(listed))
+    at = np.arange(seconds[0] + 0.0042, seconds[-1], 0.01)
+    for gap in seconds[[11, 20]] + 0.003:
+        at = at[np.abs(at - gap) > 0.05]
+    trajectories.write_tum(folder / "groundtruth.txt", between(true, seconds, at), at.round(4))
+    (root / "tum.yaml").write_text(
+        "%YAML:1.0\n"
+        + "".join(f"Camera.{key}: {of}\n" for key, of in zip(("fx", "fy"), (fx, fy)))
+        + f"Camera.cx: {cx}\nCamera.cy: {cy}\n"
+        + "".join(
+            f"Camera.{key}: {of}\n"
+            for key, of in zip(("k1", "k2", "p1", "p2", "k3"), LENSES["tum"])
+        )
+        + "Camera.cols: 480\nCamera.rows: 160\nViewer.PointSize:2\n"
+    )
+    return {
+        "euroc": (root / "MH_01", [], stamps / 1e9, truth),
+        "tum": (
+            folder,
+            ["--calibration", str(root / "tum.yaml")],
+            np.array([float(line.split()[0]) for line in listed]),
+            folder / "groundtruth.txt",
+        ),
+    }
+
+
+def by_evo(name, times, truth):
+    """True poses of the camera at the times of frames that have one, as evo has them."""
+    read = file_interface.read_tum_trajectory_file
+    if name == "euroc":
+        read = file_interface.read_euroc_csv_trajectory
+    poses = read(str(truth))
+    if name == "euroc":
+        poses.transform(T_BS, right_mul=True)
+    still = np.zeros((len(times), 3)), np.tile([1.0, 0, 0, 0], (len(times), 1))
+    frames, poses = associate_trajectories(PoseTrajectory3D(*still, times), poses, max_diff=0.01)
+    return frames.timestamps, np.array(poses.poses_se3)
+
+
+@pytest.mark.parametrize("name, missing", [("euroc", 5), ("tum", 6)])
+def test_poses_and_errors_are_those_of_evo(drives, name, missing, tmp_path, capsys):
+    folder, options, times, truth = drives[name]
+    calibration = options[1] if options else None
+    sequence = kitti.Sequence(None, folder, calibration=calibration)
+    at, poses = by_evo(name, times, truth)
+    np.testing.assert_allclose(sequence.times, at, rtol=0, atol=3e-7)  # of seconds since 1970
+    np.testing.assert_allclose(sequence.poses, poses, rtol=0, atol=1e-12)
+    assert len(sequence) == COUNT - missing
+    # the lens is taken out
+    street = Street(COUNT)
+    place = {f"{time:.4f}": index for index, time in enumerate(times)}
+    for index in (0, 9, len(sequence) - 1):
+        image = street.images[place[f"{sequence.times[index]:.4f}"]]
+        visible = sequence.visible(index)
+        inside = np.full(image.shape, True) if visible is None else visible > 0
+        assert inside.mean() > 0.5
+        difference = np.abs(sequence.frame(index).astype(int) - image)[inside]
+        assert np.median(difference) <= 4 and difference.mean() < 8
+    # errors of the run, as evo has them
+    path = tmp_path / "path.tum"
+    words = ["odometry", "--sequence", str(folder), *options, "--scale-gate", "0", "--json"]
+    assert main([*words, "--estimator", "refined", "--tum", str(path)]) == 0
+    record = json.loads(capsys.readouterr().out)
+    estimate = file_interface.read_tum_trajectory_file(str(path))
+    reference = PoseTrajectory3D(poses_se3=list(poses), timestamps=at)
+    reference, estimate = associate_trajectories(reference, estimate, max_diff=0.001)
+    assert record["frames"] == len(at) == len(estimate.timestamps)
+    shift = np.eye(4)  # to the position of frame 1, as in PySLAM
+    shift[:3, 3] = reference.positions_xyz[1] - estimate.positions_xyz[1]
+    estimate.transform(shift)
+    for path in (reference, estimate):
+        path.reduce_to_ids(range(1, len(at)))
+    error = ape(reference, estimate, PoseRelation.translation_part).stats["rmse"]
+    assert record["rmse_m"] == pytest.approx(error, rel=1e-9)
+    assert error < 0.2  # of eleven metres
+
+
+def test_a_truth_of_start_and_end_says_where_the_path_breaks(drives, capsys):
+    folder, options, times, truth = drives["tum"]
+    rows = np.loadtxt(truth)
+    short = truth.with_name("short.txt")
+    ends = (rows[:, 0] < times[8] + 0.002) | (rows[:, 0] > times[24])
+    np.savetxt(short, rows[ends], fmt="%.9f")
+    words = ["odometry", "--sequence", str(folder), *options, "--truth", str(short)]
+    assert main(words) == 0
+    said = capsys.readouterr().err
+    assert "gaps in the times: 1" in said and "--frames 9 takes the first one" in said
+    assert main([*words, "--frames", "9"]) == 0
+    assert "gaps" not in capsys.readouterr().err
+
+
+def test_a_pose_is_nearest_also_where_the_truth_is_short(drives, tmp_path):
+    """Fewer poses than frames, but closer together: evo alone gives a frame the first of them."""
+    times = np.arange(40) / 30
+    at = np.concatenate([np.arange(0, 0.05, 0.004), [1.3]])
+    poses = np.tile(np.eye(4), (len(at), 1, 1))
+    poses[:, 2, 3] = at
+    trajectories.write_tum(tmp_path / "short.txt", poses, at)
+    indices, found = trajectories.read_poses_at(tmp_path / "short.txt", times)
+    assert indices.tolist() == [0, 1, 39]
+    np.testing.assert_allclose(found[:, 2, 3], [0, 0.032, 1.3])
+
+
+@pytest.fixture
+def euroc(drives, tmp_path):
+    """A copy of EuRoC's drive that a test may change."""
+    folder = tmp_path / "MH_01"
+    for path in drives["euroc"][0].rglob("*.*"):
+        if path.is_file():
+            copy = folder / path.relative_to(drives["euroc"][0])
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            copy.write_bytes(path.read_bytes())
+    return folder
+
+
+def test_another_calibration_leaves_the_body_as_it_is(euroc, tmp_path, caplog):
+    caplog.set_level("INFO")
+    expected = kitti.Sequence(None, euroc)
+    sensor = euroc / "mav0/cam0/sensor.yaml"
+    text = sensor.read_text()
+    without = text[: text.index("T_BS")] + text[text.index("rate_hz") :]
+    (tmp_path / "own.yaml").write_text(without)
+    (tmp_path / "own.txt").write_text("300 300 239.5 79.5")
+    for name in ("own.yaml", "own.txt"):
+        sequence = kitti.Sequence(None, euroc, calibration=tmp_path / name)
+        assert np.array_equal(sequence.poses, expected.poses) and sensor in sequence.files
+    inverse = np.linalg.inv(T_BS).tolist()
+    chain = {"cam0": dict(intrinsics=[9, 9, 9, 9], distortion_coeffs=[0] * 4, T_cam_imu=inverse)}
+    (tmp_path / "chain.yaml").write_text(json.dumps(chain))
+    sequence = kitti.Sequence(None, euroc, calibration=tmp_path / "chain.yaml")
+    np.testing.assert_allclose(sequence.poses, expected.poses, atol=1e-12)
+    assert not any(record.levelname == "WARNING" for record in caplog.records)
+    # poses of the body in another form are the camera's, and it is said
+    trajectories.write_tum(tmp_path / "body.tum", expected.poses, expected.times)
+    sequence = kitti.Sequence(None, euroc, truth=tmp_path / "body.tum")
+    np.testing.assert_allclose(sequence.poses, expected.poses, atol=1e-9)
+    assert "body.tum: poses are taken as the camera's" in caplog.text
+    sensor.write_text(without)
+    kitti.Sequence(None, euroc)
+    (line,) = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+    assert "data.csv: holds poses of a body" in line
+
+
+def test_times_of_frames_are_those_that_are_listed(euroc):
+    expected = kitti.Sequence(None, euroc).times
+    frames, listed = euroc / "mav0/cam0/data", euroc / "mav0/cam0/data.csv"
+    text = listed.read_text()
+    for index, path in enumerate(sorted(frames.iterdir())):
+        path.rename(frames / f"{index:06d}.png")
+    assert np.array_equal(kitti.Sequence(None, euroc).times, expected)  # in their order
+    lines = text.splitlines()
+    named = [f"{line.split(',')[0]},{index:06d}.png" for index, line in enumerate(lines[1:])]
+    listed.write_text("\n".join([lines[0], *named, "1500000000000000000,gone.png", ""]))
+    assert np.array_equal(kitti.Sequence(None, euroc).times, expected)
+    listed.write_text("\n".join(named[:-1]))
+    with pytest.raises(InputError, match="data.csv: has no time of 000029.png"):
+        kitti.Sequence(None, euroc)
+    listed.write_text("\n".join([named[1], *named[1:]]))
+    with pytest.raises(InputError, match="data.csv: has no time of 000000.png"):
+        kitti.Sequence(None, euroc)
+    listed.write_text("\n".join(named).replace(named[3].split(",")[0], "14037"))
+    with pytest.raises(InputError, match="data.csv: .*must increase"):
+        kitti.Sequence(None, euroc)
+    listed.unlink()  # no times are stated, so poses cannot belong to frames by time
+    with pytest.raises(InputError, match="data.csv: .*--fps"):
+        kitti.Sequence(None, euroc)
+
+
+def test_masks_and_label_maps_belong_to_frames_without_distortion(
+    euroc, small_model, tmp_path, capsys
+):
+    sequence = kitti.Sequence(None, euroc).subset(4)
+    one = np.full(sequence.size, 255, np.uint8)
+    one[:40] = 0
+    for path, frame in zip(sequence.frame_paths, sequence):
+        (tmp_path / "each").mkdir(exist_ok=True)
+        cv2.imwrite(str(tmp_path / "each" / path.name), np.where(frame > 20, one, 0))
+        (tmp_path / "straight").mkdir(exist_ok=True)
+        cv2.imwrite(str(tmp_path / "straight" / path.name), frame)
+    (tmp_path / "one").mkdir()
+    cv2.imwrite(str(tmp_path / "one/bonnet.png"), one)
+    assert np.array_equal(
+        MaskFolder(tmp_path / "each", sequence)[1] > 0, (sequence[1] > 20) & (one > 0)
+    )
+    keypoints = []
+    for masks in ("one", "one/bonnet.png"):
+        words = ["odometry", "--sequence", str(euroc), "--frames", "4", "--json"]
+        assert main([*words, "--masks", str(tmp_path / masks)]) == 0
+        captured = capsys.readouterr()
+        assert "masks must be of frames without distortion" in captured.err
+        keypoints.append(json.loads(captured.out)["mean_keypoints"])
+    assert keypoints[0] == keypoints[1]
+    # `predict` makes them of the frames as the odometry sees them
+    for images, output in ((euroc, "maps"), (tmp_path / "straight", "expected")):
+        words = ["predict", "--images", str(images), "--model", str(small_model)]
+        assert main([*words, "--output", str(tmp_path / output)]) == 0
+    first = len(sorted((euroc / "mav0/cam0/data").iterdir())) - len(kitti.Sequence(None, euroc))
+    assert first > 0 and len(list((tmp_path / "maps").glob("*.png"))) == COUNT
+    source = LabelMasks(tmp_path / "maps", sequence, 3)
+    for index, path in enumerate(sequence.frame_paths):
+        expected = cv2.imread(str(tmp_path / "expected" / path.name), 0)
+        same = source.label_map(index) == expected
+        assert same.mean() > 0.999  # batches of other frames may round otherwise
+    # those of raw frames do not fit, nor those of another lens
+    model = prediction.training.load_model(small_model)
+    prediction.write_label_maps(model, sequence.frame_paths, tmp_path / "raw")
+    with pytest.raises(InputError, match="raw: made of frames with other distortion"):
+        LabelMasks(tmp_path / "raw", sequence, 3)
+    (tmp_path / "lens.txt").write_text("300 300 239.5 79.5 -0.2 0 0 0")
+    other = kitti.Sequence(None, euroc, calibration=tmp_path / "lens.txt").subset(4)
+    with pytest.raises(InputError, match="maps: made of frames with other distortion"):
+        LabelMasks(tmp_path / "maps", other, 3)
