@@ -9,7 +9,7 @@ BIN := .venv/bin
 # one of the command line; of the environment, only these are taken.
 SETTINGS := KITTI CITYSCAPES KITTI_SEMANTIC PROFILE IMAGE_SIZE BASE_FILTERS BATCH_SIZE EPOCHS FRAMES WIDTHS REPETITIONS JOBS \
             BUILD FIGURES DASK_SCHEDULER
-MINE := PYTHON GPU CAMVID PSEUDO LISTEN RUN
+MINE := PYTHON GPU CAMVID PSEUDO RAW LISTEN RUN
 of = $(foreach name,$(2),$(if $(filter $(1),$(origin $(name))),$(name)))
 given := $(filter-out $(MINE) MAKE% -%,$(sort $(call of,command line,$(.VARIABLES))))
 around := $(foreach name,$(call of,environment,$(SETTINGS)),$(if $(THESIS_REPRO_$(name)),,$(name)))
@@ -25,7 +25,7 @@ export JUPYTER_PREFER_ENV_PATH := 1
 export PYDEVD_DISABLE_FILE_VALIDATION := 1
 unexport PYTHONHOME PYTHONDONTWRITEBYTECODE PYTHONSTARTUP JUPYTER_PATH CDPATH TF_USE_LEGACY_KERAS XLA_FLAGS TF_XLA_FLAGS
 
-.PHONY: help setup figures book notebooks page evidence trainings test torture lint lab bench weights pins clean check-data
+.PHONY: help setup figures book notebooks page excerpts evidence trainings test torture lint lab bench weights pins clean check-data
 help:
 	@echo "make figures     write every table and figure to figures/, from embedded data, or from KITTI=/path CITYSCAPES=/path"
 	@echo "                 (KITTI_SEMANTIC=/path: also test the label maps); size: PROFILE=smoke|lab|demo|thesis, or single:"
@@ -35,7 +35,9 @@ help:
 	@echo "make lab         open copies of the notebooks in JupyterLab with PROFILE=lab (up to two minutes each);"
 	@echo "                 in a container LISTEN=0.0.0.0"
 	@echo "make check-data  check the folders KITTI=/path CITYSCAPES=/path KITTI_SEMANTIC=/path"
-	@echo "make evidence    make figures PROFILE=thesis from KITTI=/path, and keep what shows no frame"
+	@echo "make excerpts    cut the frames of the evidence from KITTI=/path RAW=/path, and check them, into build/excerpts"
+	@echo "make evidence    make figures PROFILE=thesis from KITTI=build/excerpts, and keep what shows no frame; from other"
+	@echo "                 frames, elsewhere (a few hours on two cores; FRAMES=00:0-129,04:0-37 takes parts of sequences)"
 	@echo "make trainings   after make figures: train nine more networks, and compare masks from all ten (some ten minutes)"
 	@echo "make bench       measure the relative cost of odometry and network (KITTI=/path), into build/bench.json"
 	@echo "make weights     train the shipped model anew into build/shipped, CAMVID=/path KITTI_SEMANTIC=/path PSEUDO=/path"
@@ -127,6 +129,8 @@ lab: setup
 bench: setup
 	@$(if $(KITTI),,$(BIN)/python -m thesis_repro synthesize build/world-demo)
 	@$(BIN)/python tools/bench.py --kitti "$${THESIS_REPRO_KITTI:-build/world-demo/kitti}"
+excerpts: setup
+	@$(BIN)/python tools/excerpts.py "$(KITTI)" "$(RAW)"
 evidence: setup
 	@THESIS_REPRO_PROFILE=thesis $(BIN)/python -m thesis.figures
 	@THESIS_REPRO_PROFILE=thesis $(BIN)/python tools/evidence.py

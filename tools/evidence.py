@@ -4,7 +4,8 @@
 and the label maps of the model in the package. Then this program copies the tables, the runs and
 the figures that show no frame of the data. It adds what the streets show, few keypoints, the worth
 of a keypoint, and the refined estimator with masks of every width. It says what is left. A stopped
-run resumes.
+run resumes. The frames of the manifest (`make excerpts`) are written to figures/kitti_excerpts,
+other frames beside it.
 """
 
 import time
@@ -18,7 +19,7 @@ from keypoint_study.methods import EXPLORED, IN_PLACE, METHODS
 from keypoint_study.report import style, texts
 from keypoint_study.report import worths as report_worths
 from keypoint_study.sources import Source
-from thesis import few_keypoints
+from thesis import excerpts, few_keypoints
 from thesis.settings import ROOT, read_settings
 from thesis_repro.data import kitti
 from thesis_repro.errors import InputError
@@ -56,16 +57,21 @@ STREETS = {
 texts.TEMPLATES.loader.searchpath.append(str(Path(__file__).parent))
 
 
+def opened(settings):
+    """Return the sequences of a run, as its notebooks take them."""
+    return [
+        kitti.Sequence(settings.kitti, name).subset(settings.sizes.frames)
+        for name in kitti.sequences(settings.kitti)
+    ]
+
+
 @style.applied()
 def write(settings, folder):
     """Write all tables, plots and findings into a folder.
 
     settings: of a finished `make figures` on real frames. Raises InputError if a file is missing.
     """
-    sequences = [
-        kitti.Sequence(settings.kitti, name).subset(settings.sizes.frames)
-        for name in kitti.sequences(settings.kitti)
-    ]
+    sequences = opened(settings)
     labels = needed(settings.build / "labels", "05_prediction")
     lengths = ", ".join(f"{sequence.name} ({len(sequence)} frames)" for sequence in sequences)
     note = f"odometry: real KITTI frames, {lengths}; label maps by the model in the package"
@@ -240,12 +246,23 @@ def _streets(sequences):
     return pd.DataFrame(rows)
 
 
+def folder_of(settings):
+    """Return the folder of the evidence: the one in git for its own frames alone, at its sizes."""
+    if settings.run.endswith("-thesis") and excerpts.are_those_of_the_evidence(opened(settings)):
+        return FOLDER
+    program.log.info(
+        "evidence: these are not the frames and sizes of the evidence in git, which stays as it is"
+    )
+    return settings.published.with_name(f"{settings.published.name}-evidence")
+
+
 def main():
     """Write the evidence with the settings of the environment."""
     settings = read_settings()
     with provenance.claimed(settings.build / "evidence"):
-        write(settings, FOLDER)
-        program.summary(f"tables, plots and findings: {FOLDER}")
+        folder = folder_of(settings)
+        write(settings, folder)
+        program.summary(f"tables, plots and findings: {folder}")
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 from itertools import chain
 from pathlib import Path
 
+from thesis import excerpts
 from thesis.settings import Settings
 from thesis_repro.checks import report
 from thesis_repro.data import cityscapes, kitti
@@ -15,6 +16,8 @@ def check(settings: Settings) -> bool:
     The names, sizes and times of the files are written beside the results, and again if they have
     changed: then the notebooks are executed again. Raises InputError if a file is missing.
     """
+    for name, first, last in settings.ranges:
+        excerpts.cut(kitti.Sequence(settings.whole, name), first, last, settings.kitti, name)
     path = settings.build / "checked"
     kitti_root = None if settings.kitti_is_embedded else settings.kitti
     cityscapes_root = None if settings.cityscapes_is_embedded else settings.cityscapes

@@ -130,7 +130,7 @@ class Settings:
 
     profile: str
     sizes: Profile
-    kitti: Path  # the user's KITTI folder, or the one of the embedded world
+    kitti: Path  # the user's KITTI folder, an excerpt of it, or the one of the embedded world
     cityscapes: Path
     kitti_is_embedded: bool
     cityscapes_is_embedded: bool
@@ -143,6 +143,9 @@ class Settings:
     scheduler: str | None = None  # address of a Dask scheduler
     kitti_semantic: Path | None = None  # the user's folder of KITTI street scenes with label maps
     seed: int = 0
+    # name, first and last frame of each sequence, if `kitti` has only these of the user's folder
+    ranges: tuple[tuple[str, int, int], ...] = ()
+    whole: Path | None = None  # the user's folder then
 
     @property
     def uses_shipped_model(self) -> bool:
@@ -207,13 +210,30 @@ def path_of_letters_digits_and_dashes(text: str) -> Path:
     return folder(text)
 
 
+def number_of_frames_or_ranges(text: str) -> int | tuple | None:
+    """Return a number of frames, None for "all", or ranges.
+
+    A range has a sequence, its first and its last frame: "00:0-129,04:0-37" is
+    (("00", 0, 129), ("04", 0, 37)).
+    """
+    if ":" not in text:
+        return number_of_frames(text)
+    ranges = {}
+    for word in text.split(","):
+        found = re.fullmatch(r"([\w.+-]+):(\d+)-(\d+)", word)
+        if found is None or found[1] in ranges or int(found[2]) > int(found[3]):
+            raise ValueError
+        ranges[found[1]] = int(found[2]), int(found[3])
+    return tuple((name, *ranges[name]) for name in sorted(ranges))
+
+
 DATA = {"KITTI": existing_folder, "CITYSCAPES": existing_folder, "KITTI_SEMANTIC": existing_folder}
 SIZES: dict[str, Callable] = {  # of a profile
     "IMAGE_SIZE": positive_whole_number,
     "BASE_FILTERS": positive_whole_number,
     "BATCH_SIZE": positive_whole_number,
     "EPOCHS": positive_whole_number,
-    "FRAMES": number_of_frames,
+    "FRAMES": number_of_frames_or_ranges,
     "WIDTHS": list_of_widths,
     "REPETITIONS": positive_whole_number,
 }
@@ -247,18 +267,24 @@ def read_settings(environment: Mapping[str, str] | None = None) -> Settings:
     profile = values.get("PROFILE", "demo")
     folders = {name: values[name] for name in DATA if name in values}
     changes = {name.lower(): values[name] for name in SIZES if name in values}
+    ranges = changes["frames"] if isinstance(changes.get("frames"), tuple) else ()
+    if ranges:
+        changes["frames"] = None  # all of what is cut
+        if "KITTI" not in folders:
+            raise InputError("FRAMES: ranges of frames are those of a folder KITTI=...; give both")
     sizes = replace(PROFILES[profile], **changes)
-    run = _run_name(folders, profile, sizes)
+    run = "-".join([_run_name(folders, profile, sizes), *("_".join(map(str, r)) for r in ranges)])
     published = values.get("FIGURES", ROOT / "figures")
     if run != "embedded-demo":
         # figures/ holds the figures of the default run; every other run gets a folder in it
         published /= run
     build = values.get("BUILD", ROOT / "build")
     world = build / f"world-{profile}"
+    kitti = folders.get("KITTI", world / "kitti")
     return Settings(
         profile=profile,
         sizes=sizes,
-        kitti=folders.get("KITTI", world / "kitti"),
+        kitti=build / run / "frames" if ranges else kitti,
         cityscapes=folders.get("CITYSCAPES", world / "cityscapes"),
         kitti_is_embedded="KITTI" not in folders,
         cityscapes_is_embedded="CITYSCAPES" not in folders,
@@ -270,6 +296,8 @@ def read_settings(environment: Mapping[str, str] | None = None) -> Settings:
         jobs=values.get("JOBS") or cores(),
         scheduler=values.get("DASK_SCHEDULER"),
         kitti_semantic=folders.get("KITTI_SEMANTIC"),
+        ranges=ranges,
+        whole=kitti if ranges else None,
     )
 
 
