@@ -43,6 +43,9 @@ COUNTS = {
 PYSLAM = {
     "00": (1.431455, 0.509210),
     "00_masked": (1.457628, 0.549792),
+    "01": (11.562321, 4.386078),  # from frame 17 on, the vote moves the camera backwards
+    "03": (0.287625, 0.107206),
+    "03_masked": (0.280460, 0.101638),
     "06": (0.357133, 0.146225),
 }
 
@@ -57,17 +60,20 @@ def separately(sequence, runs):
     "make, runs",
     [
         (odometry.run_many, ["00", "00_masked"]),
+        (odometry.run_many, ["03", "03_masked"]),
+        (separately, ["01"]),
         (separately, ["06"]),
         pytest.param(separately, ["00", "00_masked"], marks=pytest.mark.torture),  # 40 seconds
     ],
 )
 def test_agrees_with_pyslam_on_every_frame(kitti_real, reference, make, runs):
     sequence = Sequence(kitti_real, runs[0])
-    masks = {"00_masked": MaskFolder(reference / "masks_00", sequence)} if len(runs) > 1 else {}
-    results = make(sequence, {run: (THESIS, masks.get(run)) for run in runs})
+    masks = MaskFolder(reference / f"masks_{runs[0]}", sequence) if len(runs) > 1 else None
+    results = make(sequence, {run: (THESIS, masks if "_" in run else None) for run in runs})
     for run, result in results.items():
-        expected, true = pd.read_csv(reference / f"{run}.csv"), Sequence(kitti_real, run[:2]).poses
-        assert len(result.frames) == len(expected) == len(true) and result.flagged.empty
+        expected, true = pd.read_csv(reference / f"{run}.csv"), sequence.poses
+        assert len(result.frames) == len(expected) == len(true)
+        assert result.flagged.empty or run == "01"
         for ours, theirs in COUNTS.items():
             counts = result.frames[ours].to_numpy(float, na_value=np.nan)
             np.testing.assert_array_equal(counts, expected[theirs])
