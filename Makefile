@@ -25,7 +25,7 @@ export JUPYTER_PREFER_ENV_PATH := 1
 export PYDEVD_DISABLE_FILE_VALIDATION := 1
 unexport PYTHONHOME PYTHONDONTWRITEBYTECODE PYTHONSTARTUP JUPYTER_PATH CDPATH TF_USE_LEGACY_KERAS XLA_FLAGS TF_XLA_FLAGS
 
-.PHONY: help setup figures book notebooks page excerpts evidence trainings test torture lint lab bench weights pins clean check-data
+.PHONY: help setup figures book notebooks page excerpts evidence timings pictures camvid trainings test torture lint lab bench weights pins clean check-data
 help:
 	@echo "make figures     write every table and figure to figures/, from embedded data, or from KITTI=/path CITYSCAPES=/path"
 	@echo "                 (KITTI_SEMANTIC=/path: also test the label maps); size: PROFILE=smoke|lab|demo|thesis, or single:"
@@ -38,8 +38,11 @@ help:
 	@echo "make excerpts    cut the frames of the evidence from KITTI=/path RAW=/path, and check them, into build/excerpts"
 	@echo "make evidence    make figures PROFILE=thesis from KITTI=build/excerpts, and keep what shows no frame; from other"
 	@echo "                 frames, elsewhere (a few hours on two cores; FRAMES=00:0-129,04:0-37 takes parts of sequences)"
+	@echo "make timings     after make figures, or make evidence KITTI=build/excerpts: measure the times that their figures show"
 	@echo "make trainings   after make figures: train nine more networks, and compare masks from all ten (some ten minutes)"
 	@echo "make bench       measure the relative cost of odometry and network (KITTI=/path), into build/bench.json"
+	@echo "make camvid      train the thesis's network at its size on CAMVID=/path, into figures/camvid (many hours; EPOCHS=10)"
+	@echo "make pictures    draw the pictures of real streets from KITTI=build/excerpts"
 	@echo "make weights     train the shipped model anew into build/shipped, CAMVID=/path KITTI_SEMANTIC=/path PSEUDO=/path"
 	@echo "make book        after make figures: write all of its book, with the reference, into build/; a warning is an error"
 	@echo "make page, pins  write gallery, README and docs/answer.md anew from the tables in git; resolve the pins of environment.txt anew"
@@ -135,8 +138,14 @@ evidence: setup
 	@THESIS_REPRO_PROFILE=thesis $(BIN)/python -m thesis.figures
 	@THESIS_REPRO_PROFILE=thesis $(BIN)/python tools/evidence.py
 	@$(BIN)/python tools/write_texts.py
+timings: setup
+	@$(if $(KITTI),THESIS_REPRO_PROFILE=thesis) $(BIN)/python tools/timings.py
+pictures: setup
+	@$(BIN)/python tools/pictures.py
 trainings: setup
 	@$(BIN)/python tools/trainings.py
+camvid: setup
+	@THESIS_REPRO_PROFILE=$(or $(THESIS_REPRO_PROFILE),thesis) $(BIN)/python tools/camvid.py "$(CAMVID)"
 weights: setup
 	@$(BIN)/python tools/train_shipped.py "$(CAMVID)" "$(KITTI_SEMANTIC)" "$(PSEUDO)" build/shipped
 # Not `setup`, which would install what is not resolved yet.
@@ -144,5 +153,5 @@ pins: $(if $(wildcard $(BIN)/uv),,setup)
 	@$(BIN)/python tools/pins.py
 clean:
 	rm -rf .venv build *.egg-info .pytest_cache .ruff_cache .mypy_cache
-	find figures -mindepth 1 -maxdepth 1 -type d -not -name kitti_excerpts -not -name timings -exec rm -rf {} +
+	find figures -mindepth 1 -maxdepth 1 -type d -not -name kitti_excerpts -not -name camvid -not -name timings -exec rm -rf {} +
 	find . -name __pycache__ -prune -exec rm -rf {} +

@@ -8,6 +8,7 @@ run resumes. The frames of the manifest (`make excerpts`) are written to figures
 other frames beside it.
 """
 
+import sys
 import time
 from pathlib import Path
 
@@ -19,18 +20,18 @@ from keypoint_study.methods import EXPLORED, IN_PLACE, METHODS
 from keypoint_study.report import style, texts
 from keypoint_study.report import worths as report_worths
 from keypoint_study.sources import Source
-from thesis import excerpts, few_keypoints
-from thesis.settings import ROOT, read_settings
+from thesis import chapter4, excerpts, few_keypoints, section_4_2, timing
+from thesis.settings import read_settings
 from thesis_repro.data import kitti
 from thesis_repro.errors import InputError
 from thesis_repro.odometry import metrics
 from thesis_repro.running import program, provenance
 from thesis_repro.running.files import needed, write_text
 
-FOLDER = ROOT / "figures" / "kitti_excerpts"
+FOLDER = excerpts.FOLDER
 # Figures and tables of notebooks 8 and 9. Other notebooks draw frames, which are not ours to give.
 KEPT = (
-    *(f"figure_4_{number:02d}" for number in (6, 7, *range(9, 18))),
+    *(f"figure_4_{number:02d}" for number in (6, 7, 9, 10, 11, 12, 17)),
     *(f"table_4_{number}" for number in (1, 2, 3)),
     "comparison",
     "widths",
@@ -99,6 +100,7 @@ def write(settings, folder):
         made.append(make())
         print(f"{name}: done in {time.monotonic() - started:.0f} s", flush=True)
     few_runs, times, worths, of_widths = made
+    times = timing.recorded(settings, "few_keypoints", times)
     few = few_keypoints.ratios_to_all(few_runs)
     streets = _streets(sequences)
     provenance.sweep(folder)
@@ -121,7 +123,8 @@ def write(settings, folder):
         "new_streets": table_of_new_streets(worths),
     }
     for name, rows in for_readers.items():
-        style.save_table(rows, folder, name, note)
+        timed_on = f"; {timing.told(times)}" if name == "few_keypoints" else ""
+        style.save_table(rows, folder, name, note + timed_on)
     tables = {name: _read(settings, name) for name in RUNS} | {
         "few_keypoints_runs": few_runs,
         "worth_runs": worths,
@@ -131,6 +134,7 @@ def write(settings, folder):
         # six digits are enough: shuffling the matched points changes more
         text = rows.to_csv(index=False, lineterminator="\n", float_format="%.6g")
         write_text(folder / f"{name}.csv", text)
+    draw(folder)
     findings = needed(settings.figures / "findings.md", "08_results").read_text(encoding="utf-8")
     write_text(
         folder / "README.md",
@@ -145,6 +149,29 @@ def write(settings, folder):
             },
         ),
     )
+
+
+@style.applied()
+def draw(folder):
+    """Draw what tables of the evidence show: Figures 4.13 to 4.16, and 4.17 if times are there."""
+    note = (folder / "table_4_1.md").read_text(encoding="utf-8").splitlines()[-1]
+    runs = pd.read_csv(folder / "runs.csv", dtype={"sequence": str}, low_memory=False)
+    runs = runs[runs["estimator"] == "thesis"]
+    best = section_4_2.of_chosen_width(runs[runs["method"] == "masked"])
+    shown = pd.concat([runs[runs["method"].isin(["baseline", "reduced"])], best])
+    figures = {
+        "figure_4_13": chapter4.figure_of_bars(shown, "rmse"),
+        "figure_4_14": chapter4.panels_of_bars(shown, "rmse"),
+        "figure_4_15": chapter4.figure_of_bars(shown, "mae"),
+        "figure_4_16": chapter4.panels_of_bars(shown, "mae"),
+    }
+    for name, figure in figures.items():
+        style.save_figure(figure, folder, name, note)
+    times = folder / "timings" / "seconds.csv"
+    if times.is_file():
+        seconds = pd.read_csv(times, dtype={"sequence": str})
+        figure = timing.figure_4_17(seconds, embedded=False)
+        style.save_figure(figure, folder, "figure_4_17", f"{note}; {timing.told(seconds)}")
 
 
 def _read(settings, name):
@@ -248,7 +275,7 @@ def _streets(sequences):
 
 def folder_of(settings):
     """Return the folder of the evidence: the one in git for its own frames alone, at its sizes."""
-    if settings.run.endswith("-thesis") and excerpts.are_those_of_the_evidence(opened(settings)):
+    if excerpts.is_evidence(settings):
         return FOLDER
     program.log.info(
         "evidence: these are not the frames and sizes of the evidence in git, which stays as it is"
@@ -257,7 +284,10 @@ def folder_of(settings):
 
 
 def main():
-    """Write the evidence with the settings of the environment."""
+    """Write the evidence with the settings of the environment. --draw: only draw its tables."""
+    if sys.argv[1:] == ["--draw"]:
+        draw(FOLDER)
+        return
     settings = read_settings()
     with provenance.claimed(settings.build / "evidence"):
         folder = folder_of(settings)

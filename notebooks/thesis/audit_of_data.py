@@ -142,23 +142,27 @@ def of_earlier_notebooks(settings: Settings, count: int) -> list[dict[str, Any]]
 
 
 def of_times(settings: Settings) -> list[dict[str, Any]]:
-    """Return rows 16, 47 and 49, from the times that notebook 08 used."""
+    """Return rows 16, 47 and 49, from the times that notebook 08 shows."""
     seconds, stages = (timing.recorded(settings, name) for name in ("seconds", "budget"))
-    by_sequence = seconds.groupby("sequence")
-    savings = pd.DataFrame({name: timing.time_savings(rows) for name, rows in by_sequence})
-    together = timing.time_savings(seconds).reindex(WIDTHS).mean()
-    over_all = 1 + savings / 100  # one row a width
-    narrow = over_all.iloc[0] / over_all.iloc[-1]
+    of_each = {name: timing.time_savings(rows) for name, rows in seconds.groupby("sequence")}
+    timed_on: dict[str, Any] = {"data": timing.told(seconds)}
+    measurements = []
+    for place, (threads, saved) in enumerate(timing.time_savings(seconds).items()):
+        on = f", {threads}" if place else ""  # first on one thread
+        savings = pd.DataFrame({name: each[threads] for name, each in of_each.items()})
+        over_all = 1 + savings / 100  # one row a width
+        narrow = over_all.iloc[0] / over_all.iloc[-1]
+        typical = over_all.reindex(WIDTHS).mean()
+        measurements += [
+            measurement("47", TIME_TOGETHER + on, saved.reindex(WIDTHS).mean(), "%", **timed_on),
+            ratio("47", TIME_TYPICAL + on, typical, **timed_on),
+            ratio("47", TIME_OF_NARROW + on, narrow, **timed_on),
+        ]
     totals = stages.groupby("method")["milliseconds"].sum()
     whole = totals.drop(UNMASKED) / totals[UNMASKED]
-    timed_on: dict[str, Any] = {"data": f"timed on {stages['processor'].iloc[0]}"}
-    together = "whole frame with masks and network over all keypoints"
-    measurements = [
-        measurement("47", TIME_TOGETHER, together, "%", **timed_on),
-        ratio("47", TIME_TYPICAL, over_all.reindex(WIDTHS).mean(), **timed_on),
-        ratio("47", TIME_OF_NARROW, narrow, **timed_on),
-        measurement("16", together, whole, "ratio", **timed_on),
-    ]
+    timed_on = {"data": timing.told(stages)}
+    text = "whole frame with masks and network over all keypoints"
+    measurements.append(measurement("16", text, whole, "ratio", **timed_on))
     for row in stages[stages["method"] != UNMASKED].sort_values("stage").itertuples():
         time, stage = row.milliseconds, {"metric": row.stage, **timed_on}
         measurements.append(measurement("49", "milliseconds a frame", time, "ms", **stage))

@@ -1,4 +1,4 @@
-"""Figures 2.2, 2.7 to 2.9, 2.11 and 2.12, drawn from the project's network and data.
+"""Figures 2.2, 2.7 to 2.12, drawn from the project's network and data.
 
 Diagrams are in `diagrams`; cells of the notebooks draw lines and bars of one formula or table.
 """
@@ -302,3 +302,28 @@ def show_numbers(
     style.show_image(axes, image, title, cmap="PuOr", vmin=-limit, vmax=limit)
     for (row, column), value in np.ndenumerate(values):
         axes.text(column, row, format(value, form), ha="center", va="center", fontsize=8)
+
+
+def enlarge_end(figure: plt.Figure, poses: np.ndarray, true: np.ndarray) -> None:
+    """Figure 2.10: show beside a path from above where its end is, and where the true end is.
+
+    figure: of `paths.figure_of_paths`. poses, true: (n, 4, 4).
+    """
+    above = figure.axes[0]
+    ends = np.array([poses[-1, [0, 2], 3], true[-1, [0, 2], 3]])
+    distance = float(np.linalg.norm(ends[0] - ends[1]))
+    middle, half = ends.mean(axis=0), 2 * distance
+    inset = above.inset_axes((0.03, 0.2, 0.42, 0.42))
+    for line in above.lines:
+        width = 1.5 * line.get_linewidth()
+        inset.plot(*line.get_data(), color=line.get_color(), linewidth=width, alpha=0.7)
+    arrow = {"arrowstyle": "<->", "shrinkA": 0, "shrinkB": 0}
+    inset.annotate("", ends[0], ends[1], arrowprops=arrow)
+    text = f"the end, enlarged:\n{100 * distance:.1f} cm apart"
+    inset.text(0.5, 0.95, text, transform=inset.transAxes, fontsize=7, ha="center", va="top")
+    limits = [(centre - half, centre + half) for centre in middle]
+    inset.set(xlim=limits[0], ylim=limits[1], xticks=[], yticks=[], aspect="equal")
+    inset.spines[:].set_visible(True)
+    indicator = above.indicate_inset_zoom(inset, edgecolor="black")
+    for place, connector in enumerate(indicator.connectors or ()):
+        connector.set_visible(place == 1)  # upper left: the others cross the path

@@ -37,7 +37,7 @@ METHODS = {
     "masked": ("masked, best width", MASKED),
     "reduced": ("plainly reduced", REDUCED),
 }
-COLORS = [color for _, color in METHODS.values()]
+SQUEEZED = 3  # times the second highest sequence: a higher one breaks the axis of bars
 LINES = ["-o", "--s", "-.^", ":D"] * 3  # of up to twelve sequences, beside their colours
 BAND = "lowest to highest of the repetitions"
 # cross on a failed run (see `ratios.has_failed`), and on a mean over runs of which one failed
@@ -102,8 +102,7 @@ def figure_4_08(views: list[View], title: str) -> plt.Figure:
     return figure
 
 
-# by how much errors may be enlarged in a figure of paths
-ENLARGEMENTS = (1, 2, 5, 10, 20, 50, 100)
+HIDDEN = 0.02  # of a path's extent: about the width of its line in a panel
 # what is special in the runs of a method
 SPECIAL = {"masked": ("dilation_width", ", width {:.0f}")}
 SPECIAL["reduced"] = ("max_keypoints", ", {:.0f} keypoints")
@@ -116,11 +115,11 @@ def figure_paths(
 ) -> plt.Figure:
     """Figures 4.6, 4.11, 4.12: the paths from above, and below each its distance to the truth.
 
-    Small errors are enlarged in the paths, by a factor that is in the panel's title.
+    Where the line of the true path hides all errors, the panel's title says so.
     truths: {sequence: ground-truth positions (n, 3)}. rows: the runs to draw, of one method;
     repetition 0 is bold, the other repetitions are faint. paths: {(sequence, run): estimated
-    positions (n, 3)}. All paths of a sequence, also those of other methods, choose its factor and
-    the limits of its panel, so that the figures can be compared.
+    positions (n, 3)}. All paths of a sequence, also those of other methods, choose the limits of
+    its panels, so that the figures can be compared.
     """
     groups = dict(iter(rows.sort_values("repetition").groupby("sequence")))
     columns = min(4, len(groups))
@@ -136,13 +135,13 @@ def figure_paths(
     errors = ratios.range_over_repetitions(rows, "rmse")
     for (above, below), (name, runs) in zip(pairs, groups.items(), strict=False):
         of_sequence = {run: path for (sequence, run), path in paths.items() if sequence == name}
-        factor = _draw_paths(above, below, truths[name], of_sequence, runs)
+        hidden = _draw_paths(above, below, truths[name], of_sequence, runs)
         # two digits that are not zero, such as 0.0078
         mean, *span = (f"{float(f'{value:.2g}'):g}" for value in errors.loc[name])
         repeated = f" ({'-'.join(span)})" if len(runs) > 1 else ""
-        enlarged = f"errors x{factor} in the path" if factor > 1 else "errors not enlarged"
         column, special = SPECIAL.get(runs["method"].iloc[0], ("frames", ""))
-        title = f"{name}{special.format(runs[column].iloc[0])}\n{mean}{repeated} m\n{enlarged}"
+        title = f"{name}{special.format(runs[column].iloc[0])}\n{mean}{repeated} m"
+        title += "\nhidden by the line" if hidden else "\n"
         above.set_title(title, fontsize=8)
         below.set_xlabel("way (m)", fontsize=7.5, labelpad=1)
         for panel in (above, below):
@@ -163,34 +162,35 @@ def _draw_paths(
     true: np.ndarray,
     paths: dict[str, np.ndarray],
     runs: pd.DataFrame,
-) -> int:
+) -> bool:
     """Draw the paths of runs over one sequence from above, and below their distances to the truth.
 
-    true: positions (n, 3). paths: {run: (n, 3)}, also those of other runs. Returns the factor by
-    which errors are enlarged above.
+    true: positions (n, 3). paths: {run: (n, 3)}, also those of other runs. Returns whether the line
+    of the true path hides all errors of these runs.
     """
     above.plot(true[:, 0], true[:, 2], color=TRUTH, linewidth=3, alpha=0.3, label="true path")
     # paths meet at frame 1, as for the RMSE
     errors = {run: path - path[1] - (true - true[1]) for run, path in paths.items()}
-    largest = max(np.abs(list(errors.values())).max(), 1e-9)
-    room = max(0.15 * np.ptp(true[:, [0, 2]], axis=0).max() / largest, 1)
-    factor = max(scale for scale in ENLARGEMENTS if scale <= room)
+    distances = {run: np.linalg.norm(error, axis=1) for run, error in errors.items()}
     for error in errors.values():
-        above.update_datalim((true + factor * error)[:, [0, 2]])
+        above.update_datalim((true + error)[:, [0, 2]])
     along = np.insert(np.linalg.norm(np.diff(true, axis=0), axis=1).cumsum(), 0, 0)
     for run in runs.itertuples():
         line: dict[str, Any] = {"linewidth": 0.6, "alpha": 0.45, "label": "matched points shuffled"}
         if run.repetition == 0:
             line = {"linewidth": 1.2, "alpha": 1, "label": "estimated path", "zorder": 3}
-        drawn = true + factor * errors[run.run]
-        distance = np.linalg.norm(errors[run.run], axis=1)
-        for panel, across, up in ((above, drawn[:, 0], drawn[:, 2]), (below, along, distance)):
+        drawn = true + errors[run.run]
+        for panel, across, up in (
+            (above, drawn[:, 0], drawn[:, 2]),
+            (below, along, distances[run.run]),
+        ):
             panel.plot(across, up, color=METHODS[run.method][1], **line)
             if run.failed > 0 or run.lost > 0:
                 panel.plot(across[-1], up[-1], **FAILED)
     above.set_aspect("equal", adjustable="datalim")
-    below.set_ylim(0, None)
-    return factor
+    below.set_ylim(0, 1.05 * max(distance.max() for distance in distances.values()) or None)
+    extent = np.ptp(true[:, [0, 2]], axis=0).max()
+    return max(distances[run].max() for run in runs["run"]) < HIDDEN * extent
 
 
 def figure_against_width(masked: pd.DataFrame, baseline: pd.DataFrame, metric: str) -> plt.Figure:
@@ -262,3 +262,77 @@ def mark_failed(axes: plt.Axes, failed: pd.DataFrame) -> None:
     for bars, name in zip(methods, failed, strict=True):
         for bar in compress(bars, failed[name].eq(True)):
             axes.plot(bar.get_x() + bar.get_width() / 2, bar.get_height(), **FAILED)
+
+
+def bars(axes: plt.Axes, runs: pd.DataFrame, metric: str) -> None:
+    """Draw a bar for each method of METHODS and each sequence at the mean of a metric.
+
+    Error bars go from the lowest to the highest repetition. runs: those of all methods.
+    """
+    names = runs["method"].map({method: title for method, (title, _) in METHODS.items()})
+    by_method = runs.assign(any_failed=ratios.has_failed(runs)).groupby(["sequence", names])
+    table = by_method[metric].agg(["mean", "min", "max"]).unstack("method")
+    mean, failed = table["mean"], by_method["any_failed"].any().unstack("method")
+    whiskers = np.stack([mean - table["min"], table["max"] - mean]).transpose(2, 0, 1)
+    colors = dict(METHODS.values())
+    mean.plot.bar(
+        ax=axes,
+        yerr=np.where(whiskers > 0, whiskers, np.nan),
+        color=[colors[name] for name in mean],
+        legend=False,
+        rot=0,
+        width=0.8,
+    )
+    mark_failed(axes, failed)
+
+
+def figure_of_bars(runs: pd.DataFrame, metric: str) -> plt.Figure:
+    """Figures 4.13, 4.15: the bars of all sequences on one axis.
+
+    The axis is broken where a sequence would squeeze all others. runs, metric: as for `bars`.
+    """
+    highest = runs.groupby("sequence")[metric].max().sort_values()
+    broken = len(highest) > 1 and highest.iloc[-1] > SQUEEZED * highest.iloc[-2]
+    parts: dict[str, Any] = {"height": 4, "height_ratios": [1, 2]} if broken else {"height": 3.4}
+    figure, panels = style.new_figure(1 + broken, squeeze=False, sharex=True, **parts)
+    for panel in panels.flat:
+        bars(panel, runs, metric)
+        panel.set(xlabel="", ylabel=f"{metric.upper()} (m)")
+    names = sorted(highest.index)
+    if max(map(len, names)) > 4:  # would run together
+        panels[-1, 0].set_xticklabels(names, rotation=30, ha="right", rotation_mode="anchor")
+    panels[-1, 0].set_xlabel("sequence")
+    if broken:
+        _break(panels[0, 0], panels[1, 0], highest)
+    style.legend_below(figure, panels[-1], 4)
+    return figure
+
+
+def _break(above: plt.Axes, below: plt.Axes, highest: pd.Series) -> None:
+    """Show in the lower panel all sequences but the highest, whose bars go on in the upper one."""
+    for cross in (*above.lines, *below.lines):
+        cross.set_clip_on(True)
+    below.set_ylim(0, 1.1 * highest.iloc[-2])
+    above.set_ylim(below.get_ylim()[1], 1.08 * highest.iloc[-1])
+    above.spines["bottom"].set_visible(False)
+    above.tick_params(bottom=False)
+    slash: dict[str, Any] = {"marker": [(-1, -0.6), (1, 0.6)], "markersize": 8, "color": "black"}
+    for panel, height in ((above, 0), (below, 1)):
+        axis = panel.transAxes
+        panel.plot(0, height, linestyle="none", transform=axis, clip_on=False, **slash)
+    above.set_title(f"The axis is broken: {highest.index[-1]} is far above the others.", fontsize=8)
+
+
+def panels_of_bars(runs: pd.DataFrame, metric: str) -> plt.Figure:
+    """Figures 4.14, 4.16: a panel with its own scale for each sequence.
+
+    runs, metric: as for `bars`.
+    """
+    names = sorted(runs["sequence"].unique())
+    figure, panels = frames.small_panels(names)
+    for panel, name in zip(panels, names, strict=True):
+        bars(panel, runs[runs["sequence"] == name], metric)
+        panel.set(xticks=[], xlabel="")
+    figure.supylabel(f"{metric.upper()} (m)", fontsize=8)
+    style.legend_below(figure, panels, 4)
+    return figure

@@ -6,18 +6,20 @@
 import hashlib
 import os
 from collections.abc import Iterable
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
-from thesis.settings import ROOT
+from thesis.settings import ROOT, Settings
 from thesis_repro.data import kitti
 from thesis_repro.errors import InputError
 from thesis_repro.running import provenance
 from thesis_repro.running.files import write_text
 
-MANIFEST = ROOT / "figures" / "kitti_excerpts" / "frames.csv"
+FOLDER = ROOT / "figures" / "kitti_excerpts"  # of the evidence in git
+MANIFEST = FOLDER / "frames.csv"
 DECIMALS = 7  # of poses in a digest, metres: processors differ by up to 6e-14 m
 
 
@@ -45,9 +47,18 @@ def differences(sequence: kitti.Sequence, street: pd.Series) -> list[str]:
     return [part for part, digest in digests(sequence).items() if digest != street[part]]
 
 
-def are_those_of_the_evidence(sequences: list[kitti.Sequence]) -> bool:
-    """Whether sequences are the streets of the manifest, frame by frame and pose by pose."""
+def is_evidence(settings: Settings) -> bool:
+    """Whether a run has the frames and sizes of the evidence in git."""
+    if settings.kitti_is_embedded or not settings.run.endswith("-thesis"):
+        return False
+    return are_those_of_the_evidence(settings.kitti)
+
+
+@cache
+def are_those_of_the_evidence(root: Path) -> bool:
+    """Whether a folder's sequences are the manifest's, frame by frame and pose by pose."""
     manifest = read_manifest()
+    sequences = [kitti.Sequence(root, name) for name in kitti.sequences(root)]
     if [sequence.name for sequence in sequences] != list(manifest.index):
         return False
     lengths = manifest["last"] - manifest["first"] + 1

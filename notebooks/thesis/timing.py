@@ -3,21 +3,34 @@
 The widths are timed as in the thesis (Figure 4.17). The stages include the network, as Section
 5.2.2 asks for. They are timed as in a live system: one frame after the other, the network on one
 image at a time, all cores.
+
+Figures and tables in git have the times of git, which `make timings` measures anew: those of the
+default run in figures/timings, those of the evidence in figures/kitti_excerpts/timings. So a run on
+another machine changes no sentence. Other runs have their own.
 """
 
 import platform
 import time
+from collections.abc import Iterable
 from contextlib import suppress
+from datetime import date
+from importlib.metadata import version
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import cv2
+import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 
 from keypoint_study.best_width import percent_change
 from keypoint_study.jobs import CONTROL_WIDTH
-from thesis.settings import Settings, cores
+from keypoint_study.report import style
+from keypoint_study.sources import Source
+from thesis import excerpts
+from thesis.reported import REPORTED
+from thesis.settings import ROOT, Settings, cores
 from thesis_repro import masks, odometry
 from thesis_repro.data.cityscapes import resize_bilinear
 from thesis_repro.data.kitti import Sequence
@@ -27,16 +40,19 @@ from thesis_repro.running.files import progress, write_text
 
 TURNS = 2  # of each run, of which the fastest counts
 FRAMES = 20  # on which the stages are timed
+# of the leader from a line to its name
+ENDS: dict[str, Any] = {"relpos": (0, 0.5), "shrinkA": 0, "shrinkB": 3}
 WARM_UP = 3  # frames before them, which load compiled code and fill caches
 
 
-def seconds_of(sequence: Sequence, masks: Masks | None = None) -> float:
-    """Return the seconds that the odometry and its masks take in a run of its own, on one thread.
+def seconds_of(sequence: Sequence, masks: Masks | None = None, threads: int = 1) -> float:
+    """Return the seconds that the odometry and its masks take in a run of its own.
 
     The runs of `keypoint_study.runner` share work, so none of them can be timed. The first two
     steps load code and are not counted; nor are frames' files and the network, as in Section 4.2.
+    threads: of OpenCV.
     """
-    cv2.setNumThreads(1)
+    cv2.setNumThreads(threads)
     seconds = []
     for _ in range(TURNS):
         folders.forget_edges()  # which the run before has found
@@ -46,15 +62,93 @@ def seconds_of(sequence: Sequence, masks: Masks | None = None) -> float:
     return min(seconds)
 
 
-def time_savings(seconds: pd.DataFrame) -> pd.Series:
+def seconds_of_widths(
+    sequences: list[Sequence], source: Source, widths: Iterable[int]
+) -> pd.DataFrame:
+    """Time all keypoints, and masks of every width, on one thread and on all cores.
+
+    Returns one row a run, with sequence, method ("baseline" or "masked"), dilation_width, threads
+    and seconds. source: of the masks.
+    """
+    rows = []
+    threads = sorted({1, cores()})
+    timed = list(product(sequences, [0, *widths], threads))  # 0: no mask
+    for sequence, width, count in progress(timed, "timing", unit="run"):
+        masks = source.masks(sequence, width) if width else None
+        method = "masked" if width else "baseline"
+        seconds = seconds_of(sequence, masks, count)
+        rows.append([sequence.name, method, width, count, seconds])
+    columns = ["sequence", "method", "dilation_width", "threads", "seconds"]
+    return pd.DataFrame(rows, columns=columns)
+
+
+def time_savings(seconds: pd.DataFrame) -> pd.DataFrame:
     """Return the change of time (%) from all keypoints for each dilation width (Equation 4.2).
 
-    It is negative if time is saved. seconds: one row a run, with sequence, method ("baseline" or
-    "masked"), dilation_width and seconds, which are added over the sequences.
+    It is negative if time is saved. There is one column for each number of threads ("1 thread", "2
+    threads"). seconds: of `seconds_of_widths`; they are added over the sequences.
     """
-    baseline = seconds.loc[seconds["method"] == "baseline", "seconds"].sum()
-    masked = seconds[seconds["method"] == "masked"]
-    return percent_change(masked.groupby("dilation_width")["seconds"].sum(), baseline)
+    if "threads" not in seconds:  # recorded before 1.1
+        seconds = seconds.assign(threads=1)
+    columns = {}
+    for threads, rows in seconds.groupby("threads"):
+        baseline = rows.loc[rows["method"] == "baseline", "seconds"].sum()
+        of_widths = rows[rows["method"] == "masked"].groupby("dilation_width")["seconds"].sum()
+        name = f"{threads} thread" + "s" * (threads > 1)
+        columns[name] = percent_change(of_widths, baseline)
+    return pd.DataFrame(columns)
+
+
+def figure_4_17(seconds: pd.DataFrame, embedded: bool) -> plt.Figure:
+    """Figure 4.17: the change of time, with masks of each width, of all sequences and of each one.
+
+    seconds: of `seconds_of_widths`. embedded: without the thesis's numbers, which are KITTI's.
+    """
+    figure, axes = style.new_figure(height=3.6)
+    together = time_savings(seconds).rename(int)
+    count = seconds["sequence"].nunique()
+    labels = [f"all {count} timed sequences, {name}" for name in together]
+    together.set_axis(labels, axis=1).plot.bar(
+        ax=axes, color=[style.MASKED, style.SKY], rot=0, width=0.75, legend=False
+    )
+    thread = together.columns[0]
+    if count > 1:
+        ends = {}
+        for name, rows in seconds.groupby("sequence"):
+            line = time_savings(rows)[thread].to_numpy()
+            label = f"a single sequence, {thread}"
+            axes.plot(line, ".-", color="#666666", markersize=4, linewidth=0.4, label=label)
+            ends[name] = line[-1]
+        _name_ends(axes, ends, len(together) - 1)
+    if not embedded:
+        least, most = REPORTED["headline_claims"]["time_savings_percent"]
+        claim = f"the thesis, on KITTI: {least} to {most} % saved with its best widths"
+        axes.axhspan(-most, -least, color=style.GRAY, alpha=0.5, label=claim)
+    axes.axhline(0, color="black", linewidth=0.8)
+    axes.set(xlabel="dilation width (pixels)", ylabel="change of time (%)")
+    style.legend_below(figure, [axes], 2)
+    return figure
+
+
+def _name_ends(axes: plt.Axes, ends: dict[str, float], last: int) -> None:
+    """Write the names of lines at their right ends, with room between them."""
+    low, high = axes.get_ylim()
+    room = (high - low) / 17
+    names = sorted(ends, key=lambda name: ends[name])
+    heights: list[float] = []
+    for name in names:
+        heights.append(max(ends[name], heights[-1] + room) if heights else ends[name])
+    above = max(0, heights[-1] - ends[names[-1]]) / 2  # what all were pushed up, shared
+    for name, height in zip(names, heights, strict=True):
+        axes.annotate(
+            name,
+            (last, ends[name]),
+            (last + 0.8, height - above),
+            fontsize=7,
+            va="center",
+            arrowprops={"arrowstyle": "-", "color": "#999999", "linewidth": 0.4} | ENDS,
+            annotation_clip=False,
+        )
 
 
 def time_stages(
@@ -100,18 +194,65 @@ def time_stages(
     return by_stage.rename("milliseconds").reset_index()[["method", "stage", "milliseconds"]]
 
 
-def recorded(settings: Settings, name: str, measured: pd.DataFrame | None = None) -> pd.DataFrame:
-    """Return the timings that are drawn, with a column for the processor.
+def table_of_stages(stages: pd.DataFrame) -> pd.DataFrame:
+    """Return one row a stage and one column a method, their sums, and the frames a second.
 
-    They are those measured now, which are kept in a file, or those of this file if none are given.
-    Figures in git keep their timings, which would otherwise change with every machine and every
-    run.
+    stages: of `time_stages`.
     """
-    folder = settings.published if settings.figures_in_git else settings.figures
+    budget = stages.pivot(index="stage", columns="method", values="milliseconds")
+    budget = budget.loc[stages["stage"].unique(), stages["method"].unique()]
+    sums = pd.DataFrame({"all stages (ms)": budget.sum(), "frames a second": 1000 / budget.sum()})
+    budget = pd.concat([budget.round(2).rename("{} (ms)".format), sums.T.round(1)])
+    return budget.rename_axis("stage").rename_axis(None, axis=1).reset_index()
+
+
+def folder_in_git(settings: Settings) -> Path | None:
+    """Return the folder of the times in git that a run's figures show; None: they are its own."""
+    if settings.figures_in_git:
+        return ROOT / "figures" / "timings"
+    if excerpts.is_evidence(settings):
+        return excerpts.FOLDER / "timings"
+    return None
+
+
+def recorded(settings: Settings, name: str, measured: pd.DataFrame | None = None) -> pd.DataFrame:
+    """Return the times that are shown, and what `told` tells of them.
+
+    They are those in git, if the figures are those in git and there are any; otherwise those
+    measured now, which are kept in a file, or those of this file if none are given.
+    """
+    in_git = folder_in_git(settings)
+    folder = settings.figures if in_git is None else settings.build
     path = folder / "timings" / f"{name}.csv"
-    if measured is not None and not (settings.figures_in_git and path.is_file()):
-        write_text(path, measured.assign(processor=processor()).to_csv(index=False))
+    if measured is not None:
+        write_text(path, measured.assign(**circumstances(settings)).to_csv(index=False))
+    if in_git is not None and (in_git / path.name).is_file():
+        path = in_git / path.name
     return pd.read_csv(path, dtype={"sequence": str})
+
+
+def circumstances(settings: Settings) -> dict[str, str]:
+    """Return where, when and on what times are measured now: columns of their tables."""
+    sizes = settings.sizes
+    network = f"{sizes.image_size}x{sizes.image_size} pixels, {sizes.base_filters} filters"
+    if settings.uses_shipped_model:
+        network = "the model in the package"
+    return {
+        "processor": processor(),
+        "date": date.today().isoformat(),
+        "version": version("thesis-repro"),
+        "network": network,
+    }
+
+
+def told(times: pd.DataFrame) -> str:
+    """Return one line on where, when and on what times were measured. times: of `recorded`."""
+    columns = ("processor", "date", "version", "network")
+    first = {name: times[name].iloc[0] for name in columns if name in times}
+    words = [str(first["processor"])]
+    if "date" in first:  # not recorded before 1.1
+        words += [f"{first['date']}, version {first['version']}", f"network: {first['network']}"]
+    return f"timed on {'; '.join(words)}"
 
 
 def processor() -> str:

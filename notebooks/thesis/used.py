@@ -14,6 +14,7 @@ DATA = {
     "05_prediction": "thesis_repro/segmentation/weights/streets.keras",
     "09_audit": "notebooks/thesis/audit.json",
 }
+TIMED = "08_results", "09_audit"  # show the times in git, see `timing`
 
 
 def code_of(notebook: Path) -> str:
@@ -36,6 +37,9 @@ def record(folder: Path) -> None:
             digests.append("damaged")
         if notebook.stem in DATA:
             digests.append(digest_of_file(ROOT / DATA[notebook.stem]))
+        if notebook.stem in TIMED:
+            times = [*ROOT.glob("figures/timings/*"), *ROOT.glob("figures/*_excerpts/timings/*")]
+            digests += map(digest_of_file, sorted(times))
         path, text = folder / "code" / notebook.stem, "\n".join(digests)
         if not path.is_file() or path.read_text(encoding="utf-8") != text:
             write_text(path, text)

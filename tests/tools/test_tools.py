@@ -75,6 +75,7 @@ def test_evidence_keeps_what_shows_no_frame(executed, tmp_path, monkeypatch):
         "in_place",
         "left_out",
         "new_streets",
+        *(f"figure_4_{number}" for number in range(13, 17)),
         *evidence.KEPT,
         *evidence.RUNS,
     }

@@ -397,6 +397,17 @@ def test_bars_show_the_mean_of_each_method_and_its_repetitions():
     assert np.array(ends) == pytest.approx(spread[["lowest", "highest"]].to_numpy())
 
 
+def test_a_sequence_far_above_the_others_breaks_the_axis_of_bars():
+    runs = runs_of(["00", "05", "drive0005"], lambda *_: 1.0)
+    runs.loc[runs["sequence"] == "05", "rmse"] *= 50
+    runs = runs[runs["estimator"] == "thesis"]
+    above, below = chapter4.figure_of_bars(runs, "rmse").axes
+    top, others = runs["rmse"].max(), runs.loc[runs["sequence"] != "05", "rmse"].max()
+    assert others < below.get_ylim()[1] < 1.2 * others
+    assert above.get_ylim()[0] == below.get_ylim()[1] and above.get_ylim()[1] > top
+    assert len(chapter4.figure_of_bars(runs[runs["sequence"] != "05"], "rmse").axes) == 1
+
+
 HOSTILE = [
     "![a](http:x.png)",
     "![a][b]",

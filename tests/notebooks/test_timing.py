@@ -1,0 +1,83 @@
+"""Times: which are shown, and what they say about themselves."""
+
+import pandas as pd
+import pytest
+
+from keypoint_study.sources import Source
+from thesis import excerpts, timing
+from thesis.settings import ROOT, read_settings
+from thesis_repro.data.kitti import Sequence
+
+MEASURED = pd.DataFrame({"sequence": ["00"], "seconds": [0.25]})
+
+
+@pytest.fixture
+def settings(tmp_path):
+    """Of a run whose figures are not in git."""
+    names = {"PROFILE": "smoke", "BUILD": tmp_path / "build", "FIGURES": tmp_path / "figures"}
+    return read_settings({f"THESIS_REPRO_{name}": str(value) for name, value in names.items()})
+
+
+def test_a_run_shows_its_own_times_with_machine_date_version_and_sizes(settings):
+    table = timing.recorded(settings, "seconds", MEASURED)
+    assert table["seconds"].tolist() == [0.25] and table["sequence"].tolist() == ["00"]
+    told = timing.told(table)
+    for name, text in timing.circumstances(settings).items():
+        assert table[name].tolist() == [text] and text in told
+    assert timing.recorded(settings, "seconds").equals(table)  # read again
+
+
+@pytest.mark.parametrize("is_evidence", [False, True])
+def test_what_a_machine_measures_changes_no_figure_in_git(monkeypatch, tmp_path, is_evidence):
+    settings = read_settings({"THESIS_REPRO_BUILD": str(tmp_path / "build")})
+    folder = ROOT / "figures/timings"
+    if is_evidence:
+        settings = read_settings(
+            {"THESIS_REPRO_BUILD": str(tmp_path / "build"), "THESIS_REPRO_PROFILE": "thesis"}
+        )
+        monkeypatch.setattr(excerpts, "is_evidence", lambda _: True)
+        monkeypatch.setattr(excerpts, "FOLDER", tmp_path / "evidence")
+        folder = tmp_path / "evidence/timings"
+        folder.mkdir(parents=True)
+        MEASURED.assign(seconds=7.0, processor="another").to_csv(folder / "seconds.csv")
+    before = (folder / "seconds.csv").read_bytes()
+    shown = timing.recorded(settings, "seconds", MEASURED)
+    assert len(shown) and 0.25 not in shown["seconds"].tolist()
+    assert (folder / "seconds.csv").read_bytes() == before
+    own = pd.read_csv(settings.build / "timings/seconds.csv")
+    assert own["seconds"].tolist() == [0.25]
+    # what nobody has recorded is this machine's
+    assert timing.recorded(settings, "more", MEASURED)["seconds"].tolist() == [0.25]
+
+
+def test_widths_are_timed_on_one_thread_and_on_all_cores(small_world, small_labels, monkeypatch):
+    monkeypatch.setattr(timing, "cores", lambda: 2)
+    monkeypatch.setattr(timing, "TURNS", 1)
+    drive = Sequence(small_world / "kitti", "00").subset(4)
+    seconds = timing.seconds_of_widths([drive], Source(small_labels), [5])
+    runs = seconds[["method", "dilation_width", "threads"]].to_numpy().tolist()
+    assert runs == [["baseline", 0, 1], ["baseline", 0, 2], ["masked", 5, 1], ["masked", 5, 2]]
+    assert (seconds["seconds"] > 0).all()
+
+
+def test_savings_are_equation_4_2_for_each_number_of_threads():
+    rows = [("baseline", 0, 1, 10), ("masked", 5, 1, 8), ("baseline", 0, 2, 4), ("masked", 5, 2, 5)]
+    seconds = pd.DataFrame(rows, columns=["method", "dilation_width", "threads", "seconds"])
+    savings = timing.time_savings(seconds)
+    assert savings.loc[5].to_dict() == {"1 thread": -20, "2 threads": 25}
+
+
+def test_each_single_sequence_of_figure_4_17_has_its_name():
+    rows = [
+        (name, method, width, threads, 10 + 3 * number - width)
+        for number, name in enumerate(("00", "07", "drive0005"))
+        for method, width in (("baseline", 0), ("masked", 1), ("masked", 2))
+        for threads in (1, 2)
+    ]
+    columns = ["sequence", "method", "dilation_width", "threads", "seconds"]
+    figure = timing.figure_4_17(pd.DataFrame(rows, columns=columns), embedded=True)
+    (axes,) = figure.axes
+    assert {text.get_text() for text in axes.texts} == {"00", "07", "drive0005"}
+    heights = sorted(text.xyann[1] for text in axes.texts)
+    low, high = axes.get_ylim()
+    assert min(b - a for a, b in zip(heights, heights[1:])) > (high - low) / 25
