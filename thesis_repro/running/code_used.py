@@ -101,8 +101,9 @@ def _imported(text: str) -> list[str]:
             names += [each.name for each in node.names]
         elif isinstance(node, ast.ImportFrom):
             module = node.module or ""
-            inner = [f"{module}.{each.name}" for each in node.names]
-            names += [name if _path(name) else module for name in inner]
+            for each in node.names:
+                inner = f"{module}.{each.name}"
+                names.append(inner if _path(inner) else module)
     return names
 
 
