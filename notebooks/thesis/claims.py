@@ -43,6 +43,7 @@ MARGIN = verdicts.FEW_KEYPOINTS.margins["se3"]  # of the RMSE and the MAE, too: 
 REAL = "kitti_excerpts/"  # tables on real frames
 LIMIT = THESIS.max_keypoints
 REDUCTION = REPORTED["headline_claims"]["keypoint_reduction_factor"]
+HUNDREDS = 999  # keypoints at most; the thesis calls its own 762 "a few hundred"
 SAVED = REPORTED["headline_claims"]["time_savings_percent"]
 NAMED = ("00", "01", "02", "06", "08", "10")  # on which masks are said to do well
 NOT_ODOMETRY = ("read (ms)", "segmentation (ms)", "all stages (ms)", "frames a second")
@@ -354,9 +355,8 @@ def _of_keypoints(tables: Tables) -> list[Claim]:
             "a few hundred",
             "Abstract",
             f"Keypoints are limited to a few hundred. (In its Table 4.1: {reported.mean():.0f}.)",
-            f"Best widths: {best.mean():.0f} ({low:.0f}-{high:.0f}), where few is at most "
-            f"{audit_of_tables.FEW}.",
-            is_within((low, high), 1, audit_of_tables.FEW, len(best)),
+            f"Best widths: {best.mean():.0f} ({low:.0f}-{high:.0f}).",
+            is_within((low, high), 1, HUNDREDS, len(best)),
             f"200 spread over the frame, over all: aligned ATE {_ratio(spread['se3'])}, rotation "
             f"{_ratio(spread['rotation'])}.",
         ),
@@ -401,7 +401,7 @@ def _of_time(tables: Tables) -> list[Claim]:
             "Widths of 9 to 11 save 5 to 10 % of the time.",
             f"Width {tables.width}, all cores (two), one street: {both:.0f} %.",
             is_within((both, both), SAVED[0], SAVED[1], 1),
-            f"On one thread, {typical['n']} streets together (Equation 4.2): {-total['value']:.0f} %; "
+            f"On one thread, {typical['n']:.0f} streets together (Equation 4.2): {-total['value']:.0f} %; "
             f"streets differ: {100 * (1 - typical['high']):.0f} to {100 * (1 - typical['low']):.0f} %. "
             "With the package's network, which is smaller than the thesis's, a frame takes about "
             f"{whole['value']:.0f} times as long as without masks.",
@@ -524,9 +524,10 @@ def _of_the_network(tables: Tables) -> list[Claim]:
             "large and small",
             "4.1, Figure 4.2",
             "The network does well on large objects and struggles with small ones.",
-            "Embedded world: "
-            f"{large['value']:.0f} % and {small['value']:.0f} % of their pixels are right.",
-            are_apart(_ends(large), _ends(small)),
+            "Cityscapes is not at hand.",
+            CANNOT_TELL,
+            f"Embedded world: {large['value']:.0f} % and {small['value']:.0f} % of their pixels are "
+            "right.",
         ),
         Claim(
             "sky",
