@@ -80,7 +80,8 @@ def where_masks_fail(sequence, labels):
         poses = paths[name].poses if name in paths else sequence.poses
         panels[1].plot(*poses[:, [0, 2], 3].T, label=name, **look)
         panels[1].plot(*poses[FAIL_FRAME, [0, 2], 3], "o", color=look["color"], markersize=4)
-    text = f"the paths from above, over {len(sequence)} frames; dots: frame {FAIL_FRAME}"
+    text = "the paths from above (refined estimator), over"
+    text = f"{text} {len(sequence)} frames; dots: frame {FAIL_FRAME}"
     panels[1].set(xlabel="x (m)", ylabel="z (m)", title=text)
     panels[1].set_aspect("equal", adjustable="datalim")
     panels[1].legend(loc="upper left")
