@@ -9,14 +9,14 @@ H^-1 alone.
 
 import numpy as np
 
-from thesis_repro.odometry import Matches
-from thesis_repro.odometry.refined.fit import SUPPORT_THRESHOLDS, RefinedMotion, columns, near
-from thesis_repro.odometry.refined.normal_equations import normal_equations
+from thesis_repro.odometry import Matches, Motion
+from thesis_repro.odometry.refined.fit import SUPPORT_THRESHOLDS, columns, near
+from thesis_repro.odometry.refined.normal_equations import gradients_of_groups, normal_equations
 
 MIN_FIELDS = 6  # that determine the five parameters of a motion
 
 
-def variances(motion: RefinedMotion, matches: Matches, fields: np.ndarray) -> tuple[float, float]:
+def variances(motion: Motion, matches: Matches, fields: np.ndarray) -> tuple[float, float]:
     """Return the variances (degrees^2) of a fitted motion's rotation and direction.
 
     matches: N of the fit. fields: (N,), the number of the field of each. They are sums over the
@@ -30,12 +30,11 @@ def variances(motion: RefinedMotion, matches: Matches, fields: np.ndarray) -> tu
     starts = np.flatnonzero(np.diff(fields[order], prepend=-1))
     if len(starts) < MIN_FIELDS:
         return np.inf, np.inf
-    parts = np.split(np.ascontiguousarray(points[:, order]), starts[1:], axis=1)
     of_motion = motion.rotation, motion.translation
-    gradients = [
-        normal_equations(*of_motion, np.ascontiguousarray(part), scale, True)[2] for part in parts
-    ]
+    gradients = gradients_of_groups(
+        *of_motion, np.ascontiguousarray(points[:, order]), starts, scale
+    )
     _, hessian, _ = normal_equations(*of_motion, np.ascontiguousarray(points), scale, True)
-    moved = np.degrees(np.linalg.solve(hessian, np.transpose(gradients)))  # (5, fields)
+    moved = np.degrees(np.linalg.solve(hessian, gradients.T))  # (5, fields)
     squares = (moved**2).sum(axis=1)
     return float(squares[:3].sum()), float(squares[3:].sum())

@@ -11,9 +11,8 @@ The rule, which was fixed before the runs, and its limits are in docs/reading-re
 for its outcomes in `verdicts.WORTH`.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import cache, partial
-from itertools import chain, product
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -34,7 +33,7 @@ from thesis_repro.odometry import (
     metrics,
 )
 from thesis_repro.odometry.loop import MIN_MATCHES, normalise
-from thesis_repro.odometry.refined.fit import RefinedMotion, fit, smaller_rotation
+from thesis_repro.odometry.refined.fit import ahead, refine, smaller_rotation
 from thesis_repro.odometry.runs import check, inside
 from thesis_repro.odometry.sharing import SharedCalls
 
@@ -94,24 +93,26 @@ def worth_of(
         )
     taken = min(len(long_enough), steps or MAX_STEPS)
     indices = long_enough[np.linspace(0, len(long_enough) - 1, taken).round().astype(int)]
+    repetitions = {**dict.fromkeys(SPLIT, splits or SPLITS), ONE_FIT: FITS}
     shared = SharedCalls()
     rows, failed_here = [], {} if failed is None else failed
     for index in indices:
         chosen = {key: chosen[key] for key in chosen if key not in failed_here}
         random, of_choices = tracked(sequence, int(index), chosen, shared, calls, failed)
-        halves_of_random = cache(partial(_halves, random))
+        draws_of_random = cache(partial(_draws, random))
         for (name, number), tracks in of_choices.items():
             count = min(number or len(tracks.points), len(tracks.points))
-            for split, repeat in chain(
-                product(SPLIT, range(splits or SPLITS)), product([ONE_FIT], range(FITS))
-            ):
-                halves = _halves(tracks, count, split, (SEED, index, repeat, 0))
-                reference = halves_of_random(
-                    max(count, MIN_RANDOM), split, (SEED, index, repeat, 1)
+            row = {"choice": name, "number": number, "left": len(tracks.points)}
+            for split, repeats in repetitions.items():
+                seeds, others = (
+                    tuple((SEED, index, repeat, kind) for repeat in range(repeats))
+                    for kind in (0, 1)
                 )
-                row = {"choice": name, "number": number, "split": split, "left": len(tracks.points)}
-                row |= halves
-                rows.append(row | {f"random_{name}": value for name, value in reference.items()})
+                draws = _draws(tracks, count, split, seeds)
+                references = draws_of_random(max(count, MIN_RANDOM), split, others)
+                for draw, reference in zip(draws, references, strict=True):
+                    of_random = {f"random_{name}": value for name, value in reference.items()}
+                    rows.append({**row, "split": split, **draw, **of_random})
     if failed and not rows:
         raise InputError(next(iter(failed.values())))
     medians = pd.DataFrame(rows).groupby(["choice", "number", "split"], sort=False).median()
@@ -168,25 +169,32 @@ def tracked(
     return tracks.pop(_RANDOM), tracks
 
 
-def _halves(tracks: Tracks, count: int, split: str, seed: tuple[int, ...]) -> dict[str, float]:
-    """Draw keypoints, divide them, and return how far the motions of both halves are apart.
+def _draws(
+    tracks: Tracks, count: int, split: str, seeds: Iterable[tuple[int, ...]]
+) -> list[dict[str, float]]:
+    """Draw keypoints for each seed, divide them, and return how far their halves' motions differ.
 
-    Or, for ONE_FIT, how uncertain the motion of all of them is.
+    Or, for ONE_FIT, how uncertain the motion of all of them is. One a seed:
     {keypoints; rotation_deg, direction_deg: angles; rotation_variance, direction_variance: of one
     keypoint, degrees^2}
     """
-    random = np.random.default_rng(seed)
-    drawn = random.permutation(len(tracks.points))[:count]
-    if split == ONE_FIT:
-        return _one_fit(tracks, drawn)
-    in_first = SPLIT[split](tracks.points[drawn], random)
-    first, second = drawn[in_first], drawn[~in_first]
-    angles = _angles(refined_motion(tracks, first), refined_motion(tracks, second))
-    weight = max(len(first) * len(second), 1) / max(len(drawn), 1)
-    numbers: dict[str, float] = {"keypoints": len(drawn)}
-    for motion, angle in zip(MOTIONS, angles, strict=True):
-        numbers |= {f"{motion}_deg": angle, f"{motion}_variance": angle**2 * weight}
-    return numbers
+    draws: list[dict[str, float]] = []
+    pairs, weights = [], []
+    for seed in seeds:
+        random = np.random.default_rng(seed)
+        drawn = random.permutation(len(tracks.points))[:count]
+        if split == ONE_FIT:
+            draws.append(_one_fit(tracks, drawn))
+            continue
+        in_first = SPLIT[split](tracks.points[drawn], random)
+        first, second = drawn[in_first], drawn[~in_first]
+        pairs.append((refined_motion(tracks, first), refined_motion(tracks, second)))
+        draws.append({"keypoints": len(drawn)})
+        weights.append(max(len(first) * len(second), 1) / max(len(drawn), 1))
+    for draw, weight, angles in zip(draws, weights, _angles(pairs)):
+        for motion, angle in zip(MOTIONS, angles, strict=True):
+            draw |= {f"{motion}_deg": angle, f"{motion}_variance": angle**2 * weight}
+    return draws
 
 
 def _one_fit(tracks: Tracks, drawn: np.ndarray) -> dict[str, float]:
@@ -195,8 +203,8 @@ def _one_fit(tracks: Tracks, drawn: np.ndarray) -> dict[str, float]:
     motion, found = refined_motion(tracks, drawn), drawn[tracks.found[drawn]]
     if motion is not None:
         matches = Matches(tracks.current[found], tracks.previous[found], tracks.threshold)
-        _, fields = np.unique(tracks.points[found] // FIELD, axis=0, return_inverse=True)
-        variances = one_fit.variances(motion, matches, fields.ravel())
+        fields = _numbered(tracks.points[found] // FIELD)
+        variances = one_fit.variances(motion, matches, fields)
     numbers: dict[str, float] = {"keypoints": len(drawn)}
     for name, variance in zip(MOTIONS, variances, strict=True):
         variance = min(variance, NO_MOTION**2)
@@ -206,9 +214,17 @@ def _one_fit(tracks: Tracks, drawn: np.ndarray) -> dict[str, float]:
 
 def _by_fields(points: np.ndarray, random: np.random.Generator) -> np.ndarray:
     """Which of N keypoints (N, 2) are in the first half, (N,) booleans: half of the fields."""
-    fields = np.floor((points + random.uniform(0, FIELD, 2)) / FIELD)
-    _, field = np.unique(fields, axis=0, return_inverse=True)
-    return _by_points(np.arange(field.max(initial=-1) + 1), random)[field.ravel()]
+    field = _numbered(np.floor((points + random.uniform(0, FIELD, 2)) / FIELD))
+    return _by_points(np.arange(field.max(initial=-1) + 1), random)[field]
+
+
+def _numbered(fields: np.ndarray) -> np.ndarray:
+    """The number of each field among those that occur, (N,), of columns and rows of fields (N, 2).
+
+    They are sorted as one number each, which is faster than in pairs.
+    """
+    _, number = np.unique(fields @ (2.0**16, 1.0), return_inverse=True)
+    return number
 
 
 def _by_points(points: np.ndarray, random: np.random.Generator) -> np.ndarray:
@@ -220,7 +236,7 @@ SPLIT: dict[str, Callable] = {"fields": _by_fields, "points": _by_points}
 ONE_FIT = "fit"  # in place of a split: the second measure (one_fit.py)
 
 
-def refined_motion(tracks: Tracks, indices: np.ndarray) -> RefinedMotion | None:
+def refined_motion(tracks: Tracks, indices: np.ndarray) -> Motion | None:
     """Return the refined motion of some keypoints; None if they give none."""
     indices = indices[tracks.found[indices]]
     if len(indices) < MIN_MATCHES:
@@ -232,14 +248,21 @@ def refined_motion(tracks: Tracks, indices: np.ndarray) -> RefinedMotion | None:
     if matrix is None or inliers is None or matrix.shape != (3, 3) or not np.isfinite(matrix).all():
         return None
     matches = Matches(current, previous, tracks.threshold, inliers.ravel() > 0)
-    return fit(*smaller_rotation(matrix), matches)
+    rotation, heading, support = refine(*smaller_rotation(matrix), matches)
+    return Motion(rotation, *ahead(rotation, heading, support, tracks.threshold))
 
 
-def _angles(first: Motion | None, second: Motion | None) -> tuple[float, float]:
-    """Return the angles (degrees) between the rotations and the directions of two motions."""
-    if first is None or second is None:
-        return NO_MOTION, NO_MOTION
-    rotation = metrics.angles(first.rotation.T @ second.rotation)
-    sine = np.linalg.norm(np.cross(first.translation, second.translation))
-    direction = np.degrees(np.arctan2(sine, first.translation @ second.translation))
-    return float(rotation), float(direction)
+def _angles(pairs: list[tuple[Motion | None, Motion | None]]) -> list[list[float]]:
+    """Return the angles (degrees) between the rotations and the directions of pairs of motions."""
+    angles = np.full((len(pairs), 2), NO_MOTION)
+    known = [(k, *pair) for k, pair in enumerate(pairs) if None not in pair]
+    if known:
+        places, first, second = zip(*known)
+        both = list(zip(first, second))
+        turns = np.array([a.rotation.T @ b.rotation for a, b in both])
+        crosses = np.cross([a.translation for a in first], [b.translation for b in second])
+        sines = [np.linalg.norm(each) for each in crosses]
+        cosines = [a.translation @ b.translation for a, b in both]
+        angles[places, 0] = metrics.angles(turns)
+        angles[places, 1] = np.degrees(np.arctan2(sines, cosines))
+    return angles.tolist()

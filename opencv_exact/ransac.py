@@ -8,9 +8,10 @@ one of all solutions. So this search solves few samples with OpenCV:
 2. Solve them quickly with `solver.solve`. The last digits differ from OpenCV's, but the difference
    is within a margin. The margin gives bounds of OpenCV's number of inliers. A test in single
    precision rules out most solutions.
-3. Let OpenCV solve a sample if the bounds do not decide whether it beats the best one so far. Let
-   OpenCV also solve the winner.
-4. If the winner's number of inliers is outside its bounds, let OpenCV do the whole search.
+3. Follow OpenCV's search as if each sample had the most inliers that its bounds allow. Let OpenCV
+   solve the sample that wins, which gives its exact number, and follow the search again, until the
+   winner's number is exact.
+4. If a number is outside its bounds, let OpenCV do the whole search.
 
 The margin is a generous estimate, not a proof. The tests compare the results with OpenCV's.
 """
@@ -26,7 +27,7 @@ from opencv_exact import epipolar
 from opencv_exact.compiling import compiled, inlined, is_on_disk
 from opencv_exact.five_point import SAMPLE_SIZE
 from opencv_exact.real_roots import LANES
-from opencv_exact.solver import Solutions, correspondences, solve
+from opencv_exact.solver import correspondences, solve
 
 MAX_SAMPLES = 1000
 MIN_FOR_SHORTCUT = 8  # correspondences; with fewer, OpenCV does the whole search
@@ -47,35 +48,22 @@ class _Points(NamedTuple):
     probability: float
 
 
-class _Candidate(NamedTuple):
-    """A sample of five, and bounds of the number of inliers of OpenCV's best solution for it."""
+class _Samples(NamedTuple):
+    """The samples of a search, in the order in which OpenCV draws them.
 
-    sample: np.ndarray  # five indices
-    lower: int
-    upper: int
+    lower, upper: bounds of the number of inliers of OpenCV's best solution for a sample. They are 0
+    if an earlier sample has surely as many, and -1 if the sample is not drawn yet.
+    """
 
-
-class _Progress(NamedTuple):
-    """How far a search is."""
-
-    drawn: int  # number of samples; the last ones are `samples`
+    indices: np.ndarray  # (MAX_BLOCKS * LANES, 5), of correspondences
+    lower: np.ndarray  # (MAX_BLOCKS * LANES,)
+    upper: np.ndarray
     random_state: np.ndarray  # (1,) uint64
-    samples: np.ndarray  # (LANES, 5), drawn and solved together
-    solutions: Solutions  # of these samples
-    best: _Candidate
 
 
-NO_SAMPLES = np.zeros((LANES, SAMPLE_SIZE), np.int64)
-NO_SOLUTIONS = Solutions(
-    np.zeros(LANES, bool),
-    np.zeros(LANES, np.int64),
-    np.zeros((LANES, 10, 9)),
-    np.zeros((LANES, 10)),
-)
+MAX_BLOCKS = -(-MAX_SAMPLES // LANES)
 RANDOM_STATE = np.array([OPENCV_SEED], np.uint64)
-# as in OpenCV, a sample counts only if its own five correspondences are inliers
-NOBODY = _Candidate(NO_SAMPLES[0], SAMPLE_SIZE - 1, SAMPLE_SIZE - 1)
-START = _Progress(0, RANDOM_STATE, NO_SAMPLES, NO_SOLUTIONS, NOBODY)  # of every search
+NO_WINNER = -1
 
 
 class _Solution(NamedTuple):
@@ -108,12 +96,12 @@ def find_essential_matrix(
             "with the threshold divided by focal"
         )
     current, previous = as_pairs(points1), as_pairs(points2)
-    columns = np.stack([*current.T, *previous.T])
-    solution = None
-    if len(current) >= MIN_FOR_SHORTCUT and np.isfinite(columns).all():
+    columns = np.empty((4, len(current)))
+    columns[:2], columns[2:] = current.T, previous.T
+    solution, max_abs = None, np.abs(columns).max(axis=1, initial=0.0)
+    if len(current) >= MIN_FOR_SHORTCUT and np.isfinite(max_abs).all():
         with np.errstate(over="ignore"):
             columns32 = columns.astype(np.float32)
-        max_abs = np.abs(columns).max(axis=1)
         limit = float(np.float32(threshold * threshold))
         solution = _search(_Points(columns, columns32, max_abs, limit, threshold, prob))
     if solution is None:
@@ -128,7 +116,7 @@ def as_pairs(points: np.ndarray) -> np.ndarray:
 
 def is_compiled() -> bool:
     """Return whether an earlier search has compiled this module, so that it only has to load."""
-    return is_on_disk(_next_doubtful)
+    return is_on_disk(_winner)
 
 
 def draw_samples(points: int, samples: int) -> np.ndarray:
@@ -142,29 +130,17 @@ def _search(points: _Points) -> _Solution | None:
 
     None: no sample won, or the bounds were wrong.
     """
-    progress = START
-    solution = None  # of the best sample, once OpenCV has computed it
-    while True:
-        progress, challenger = _next_doubtful(points, progress)
-        best = progress.best
-        if solution is not None and best.lower > solution.inliers:  # the best is another sample
-            solution = None
-        is_over = challenger.upper == 0
-        if is_over and (best.upper < SAMPLE_SIZE or solution is not None):
-            return solution
-        # Now the exact number of inliers of the best sample matters: it decides whether the search
-        # ends, or whether the challenger is better.
-        if is_over or best.lower < best.upper:
-            solution = _opencv_solution(points, best.sample)
-            if not best.lower <= solution.inliers <= best.upper:
-                return None
-            best = _Candidate(best.sample, solution.inliers, solution.inliers)
-        if challenger.upper > best.lower:
-            other = _opencv_solution(points, challenger.sample)
-            if other.inliers > best.lower:
-                best = _Candidate(challenger.sample, other.inliers, other.inliers)
-                solution = other
-        progress = progress._replace(best=best)
+    not_drawn = np.full(MAX_BLOCKS * LANES, -1)
+    indices = np.empty((MAX_BLOCKS * LANES, SAMPLE_SIZE), np.int64)
+    samples = _Samples(indices, not_drawn, not_drawn.copy(), RANDOM_STATE.copy())
+    solutions: dict[int, _Solution | None] = {NO_WINNER: None}  # OpenCV's, by sample
+    while (winner := _winner(points, samples)) not in solutions:
+        solution = _opencv_solution(points, indices[winner])
+        if not samples.lower[winner] <= solution.inliers <= samples.upper[winner]:
+            return None
+        samples.lower[winner] = samples.upper[winner] = solution.inliers
+        solutions[winner] = solution
+    return solutions[winner]
 
 
 def _opencv(
@@ -232,49 +208,54 @@ def _draw(random_state, points, samples):
     return indices, np.array([state])
 
 
-@inlined
-def _samples_needed(probability, outliers):
-    """Number of samples among which one is free of outliers with the given probability.
+@compiled
+def _winner(points, samples):
+    """The sample that wins if each has the most inliers that its bounds allow, or NO_WINNER.
 
-    outliers: their share of the correspondences.
+    The real search goes at least as far: it stops later, the fewer inliers it has found. So a
+    winner whose bounds are equal wins the real search, too. Samples are drawn when needed.
     """
+    winner, most, needed = NO_WINNER, SAMPLE_SIZE - 1, MAX_SAMPLES
+    number = 0
+    while number < needed:
+        if samples.upper[number] < 0:
+            _draw_block(points, samples, number)
+        if samples.upper[number] > most:  # the first one if several are equal, as in OpenCV
+            winner, most = number, samples.upper[number]
+            needed = _samples_needed(points, most)
+        number += 1
+    return winner
+
+
+@inlined
+def _samples_needed(points, inliers):
+    """Number of samples among which one is free of outliers with the wanted probability."""
+    count = points.columns.shape[1]
+    outliers = (count - inliers) / count
     # probability that a sample has an outlier
     missed = 1.0 - math.pow(1.0 - outliers, float(SAMPLE_SIZE))
     if missed < SMALLEST:
         return 0
     log_missed = math.log(missed)
-    log_failure = math.log(max(1.0 - probability, SMALLEST))
+    log_failure = math.log(max(1.0 - points.probability, SMALLEST))
     if log_missed >= 0 or -log_failure >= MAX_SAMPLES * -log_missed:
         return MAX_SAMPLES
     return round(log_failure / log_missed)
 
 
-@compiled
-def _next_doubtful(points, progress):
-    """Draw samples until one may or may not be better than the best one, or the search is over.
-
-    Returns the progress, and the sample in doubt (no inliers if the search is over).
-    """
-    drawn, random_state, samples, solutions, best = progress
-    count = points.columns.shape[1]
-    needed = MAX_SAMPLES
-    if best.upper >= SAMPLE_SIZE:
-        needed = _samples_needed(points.probability, (count - best.upper) / count)
-    while drawn < needed:
-        lane = drawn % LANES
-        if lane == 0:
-            samples, random_state = _draw(random_state, count, LANES)
-            solutions = solve(correspondences(points.columns, samples))
-        drawn += 1
-        lower, upper = _inliers_of_sample(points, solutions, lane, best.lower)
-        candidate = _Candidate(samples[lane], lower, upper)
-        if lower > best.upper:  # surely better
-            best = candidate
-            needed = _samples_needed(points.probability, (count - upper) / count)
-        elif upper > best.lower:
-            return _Progress(drawn, random_state, samples, solutions, best), candidate
-    nobody = _Candidate(best.sample, 0, 0)
-    return _Progress(drawn, random_state, samples, solutions, best), nobody
+@inlined
+def _draw_block(points, samples, start):
+    """Draw LANES samples, the first one being number `start`, and solve them for their bounds."""
+    stop = start + LANES
+    indices, state = _draw(samples.random_state, points.columns.shape[1], LANES)
+    samples.indices[start:stop], samples.random_state[0] = indices, state[0]
+    solutions = solve(correspondences(points.columns, indices))
+    # as in OpenCV, a sample counts only if its own five correspondences are inliers
+    best = max(SAMPLE_SIZE - 1, samples.lower.max())
+    for lane in range(LANES):
+        lower, upper = _inliers_of_sample(points, solutions, lane, best)
+        samples.lower[start + lane], samples.upper[start + lane] = lower, upper
+        best = max(best, lower)
 
 
 @inlined

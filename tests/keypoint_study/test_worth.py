@@ -60,10 +60,10 @@ def variances(make, scenes):
     for scene in range(scenes):
         simulated = make(np.random.default_rng(scene))
         count = len(simulated.points)
-        error = worth._angles(worth.refined_motion(simulated, np.arange(count)), truth)
+        (error,) = worth._angles([(worth.refined_motion(simulated, np.arange(count)), truth)])
         row = dict(zip(("rotation_true", "direction_true"), np.square(error) * count, strict=True))
         for split in worth.SPLIT:
-            halves = worth._halves(simulated, count, split, (0, scene))
+            (halves,) = worth._draws(simulated, count, split, [(0, scene)])
             row |= {f"{name}_{split}": halves[f"{name}_variance"] for name in worth.MOTIONS}
         rows.append(row)
     return pd.DataFrame(rows).median()
@@ -228,7 +228,7 @@ def test_one_fit_sees_what_neighbours_share():
             simulated = make(np.random.default_rng(scene))
             every = np.arange(len(simulated.points))
             told.append(worth._one_fit(simulated, every))
-            true.append(worth._angles(worth.refined_motion(simulated, every), truth))
+            true += worth._angles([(worth.refined_motion(simulated, every), truth)])
         means = pd.DataFrame(told).mean() / len(every)
         squares = np.square(true).mean(axis=0)
         for name, square in zip(worth.MOTIONS, squares, strict=True):

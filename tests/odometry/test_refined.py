@@ -74,7 +74,7 @@ def test_the_fit_meets_exact_points_and_keeps_the_sign_of_the_translation():
     matches = replace(seen(street(200), turn(1), AHEAD), inliers=np.arange(200) < 150)
     for sign in (1, -1):
         direction = sign * np.array([0.05, -0.03, 1.0]) / np.linalg.norm([0.05, -0.03, 1.0])
-        rotation, translation = refine.refine(turn(1.2), direction, matches)
+        rotation, translation, _ = refine.refine(turn(1.2), direction, matches)
         np.testing.assert_allclose(rotation, turn(1), atol=1e-8)
         np.testing.assert_allclose(translation, sign * AHEAD, atol=1e-7)
 

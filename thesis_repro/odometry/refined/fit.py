@@ -54,17 +54,15 @@ def fit(rotation: np.ndarray, translation: np.ndarray, matches: Matches) -> Refi
     """Motion refined from a start, with its uncertainty.
 
     See `refine` for the arguments. The start's unit translation may have either sign: the points
-    near the motion vote on it (`cheirality_votes`).
+    near the motion vote on it (`ahead`).
     """
-    rotation, heading = refine(rotation, translation, matches)
-    threshold = matches.threshold
-    support = _support(rotation, heading, columns(matches), threshold)
-    forward, backward = cheirality_votes(rotation, heading, support, threshold)
-    rotation_std, heading_std = _deviations(rotation, heading, support, threshold / 2)
+    rotation, heading, support = refine(rotation, translation, matches)
+    signed, votes = ahead(rotation, heading, support, matches.threshold)
+    rotation_std, heading_std = _deviations(rotation, heading, support, matches.threshold / 2)
     return RefinedMotion(
         rotation,
-        heading if forward >= backward else -heading,
-        max(forward, backward),
+        signed,
+        votes,
         support=support.shape[1],
         rotation_std_deg=rotation_std,
         heading_std_deg=heading_std,
@@ -73,8 +71,8 @@ def fit(rotation: np.ndarray, translation: np.ndarray, matches: Matches) -> Refi
 
 def refine(
     rotation: np.ndarray, translation: np.ndarray, matches: Matches
-) -> tuple[np.ndarray, np.ndarray]:
-    """Motion (rotation 3x3, unit translation) fitted to all its inliers.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Motion (rotation 3x3, unit translation) fitted to all its inliers, and its support (4, M).
 
     Levenberg-Marquardt over the rotation and the two angles of the translation's direction. It
     minimises Sampson distances with Cauchy weights at half the threshold. The first fit uses the
@@ -86,20 +84,34 @@ def refine(
     with another heading (see SAME_MOTION_COSINE) is another motion and is not used. The sign of the
     given translation is kept, because the cost does not depend on it.
     """
-    threshold = matches.threshold
-    points = columns(matches)
     start = np.ascontiguousarray(rotation), np.ascontiguousarray(translation)
-    first = _rounds(*start, points, points.compress(matches.inliers, axis=1), threshold)
-    second = first
+    return _refine(*start, columns(matches), matches.inliers, matches.threshold)
+
+
+def ahead(
+    rotation: np.ndarray, heading: np.ndarray, support: np.ndarray, threshold: float
+) -> tuple[np.ndarray, int]:
+    """Heading with the sign that puts more of its support in front of the cameras, and how many."""
+    forward, backward = cheirality_votes(rotation, heading, support, threshold)
+    return (heading if forward >= backward else -heading), max(forward, backward)
+
+
+@compiled
+def _refine(r, t, points, inliers, threshold):
+    """As `refine`, of points (4, N)."""
+    first_r, first_t = _rounds(r, t, points, points[:, np.flatnonzero(inliers)], threshold)
+    second_r, second_t = first_r, first_t
     for scale in RESTART_SCALES:
-        second = _minimise(*second, points, scale * threshold)
-    second = _rounds(*second, points, _support(*second, points, threshold), threshold)
-    first_cost, _, _ = normal_equations(*first, points, threshold / 2, False)
-    second_cost, _, _ = normal_equations(*second, points, threshold / 2, False)
-    is_same_motion = abs(second[1] @ first[1]) > SAME_MOTION_COSINE
-    is_better = is_same_motion and second_cost < LOWER_COST * first_cost
-    rotation, heading = second if is_better else first
-    return rotation, (heading if heading @ translation >= 0 else -heading)
+        second_r, second_t = _minimise(second_r, second_t, points, scale * threshold)
+    support = _support(second_r, second_t, points, threshold)
+    second_r, second_t = _rounds(second_r, second_t, points, support, threshold)
+    first_cost, _, _ = normal_equations(first_r, first_t, points, threshold / 2, False)
+    second_cost, _, _ = normal_equations(second_r, second_t, points, threshold / 2, False)
+    is_same_motion = abs(matrices.dot(second_t, first_t)) > SAME_MOTION_COSINE
+    if is_same_motion and second_cost < LOWER_COST * first_cost:
+        first_r, first_t = second_r, second_t
+    heading = first_t if matrices.dot(first_t, t) >= 0 else -first_t
+    return first_r, heading, _support(first_r, heading, points, threshold)
 
 
 def _deviations(
