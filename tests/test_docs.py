@@ -1,16 +1,23 @@
 """The commands and Python examples of the README and of docs run."""
 
+import itertools
+import pydoc
 import re
 import shlex
+import textwrap
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pandas as pd
 import pytest
+from street import Street
 
+import thesis_repro as tr
 from thesis.settings import PROFILES, ROOT
 from thesis_repro.command import cli
 from thesis_repro.command.options import build_parser
+from thesis_repro.data.trajectories import read_poses, read_poses_at
 from thesis_repro.masks import KINDS
 from thesis_repro.odometry.estimators import ESTIMATORS
 
@@ -63,6 +70,22 @@ def test_the_example_of_the_readme_compares_three_paths(small_world, tmp_path, m
     assert len(capsys.readouterr().out.splitlines()) == 3
 
 
+def test_help_begins_with_an_example_that_runs(small_world, tmp_path, monkeypatch, capsys):
+    screen = pydoc.plain(pydoc.render_doc(tr)).splitlines()[:24]
+    named = re.findall(r"\w+", "\n".join(screen))
+    assert {"spread", "orb", "refined", "run_many"} <= {*named}
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "world").symlink_to(small_world)
+    (tmp_path / "labels").symlink_to(small_world / "kitti/sequences/00/labels_0")
+    example = textwrap.dedent("\n".join(re.findall(r"^    .*", tr.__doc__, re.MULTILINE)))
+    assert len(example.splitlines()) <= 15
+    names = {}
+    exec(example, names)
+    for name in names["runs"]:
+        assert len(read_poses(f"{name}.txt")) == 12
+    assert names["result"].frames["detected"].mean() == 200  # the last one, spread
+
+
 def test_the_first_training_is_that_of_the_comparison():
     trainings = pd.read_csv(ROOT / "figures/trainings.csv")
     compared = pd.read_csv(ROOT / "figures/comparison.csv")
@@ -77,6 +100,16 @@ def test_the_first_training_is_that_of_the_comparison():
             assert line[name].rstrip(" ↑↓") == "{:.2f} ({:.2f}-{:.2f})".format(*ends)
 
 
+class Camera:
+    """A camera that drives past walls of noise and never stops."""
+
+    def __init__(self):
+        self.frames = itertools.cycle(Street(12).images)
+
+    def read(self):
+        return True, cv2.cvtColor(next(self.frames), cv2.COLOR_GRAY2BGR)
+
+
 @pytest.fixture
 def examples(small_world, tmp_path, monkeypatch):
     """The Python recipes for what people bring, run beside a world and its frames and video."""
@@ -89,6 +122,11 @@ def examples(small_world, tmp_path, monkeypatch):
     for image in images:
         video.write(image)
     video.release()
+    answers = iter([-1] * 8 + [ord("q")])  # of the keyboard, once a frame of the live camera
+    monkeypatch.setattr(cv2, "waitKey", lambda _: next(answers), raising=False)
+    monkeypatch.setattr(cv2, "imshow", lambda *_: None, raising=False)
+    stored = cv2.VideoCapture
+    monkeypatch.setattr(cv2, "VideoCapture", lambda name: Camera() if name == 0 else stored(name))
     results = []
     for example in blocks(ROOT / "docs/own-masks.md", "python"):
         names = {"lines": len(example.splitlines())}
@@ -98,8 +136,9 @@ def examples(small_world, tmp_path, monkeypatch):
 
 
 def test_the_recipes_for_what_people_bring_run(examples, tmp_path):
-    images, (memory, network, step, detectors, own, video) = examples
-    assert max(recipe["lines"] for recipe in (memory, step, detectors, video)) <= 15
+    images, (memory, network, whole, kept, live, step, detectors, own, video) = examples
+    short = memory, whole, kept, live, step, detectors, video
+    assert max(recipe["lines"] for recipe in short) <= 15
 
     drive, result = memory["drive"], memory["result"]
     assert len(drive) == len(images) == len(result.poses)
@@ -110,6 +149,21 @@ def test_the_recipes_for_what_people_bring_run(examples, tmp_path):
     u, v = last.keypoints.astype(int).T
     assert len(u) > 100 and mask[v, u].all()
     assert 10 < np.linalg.norm(last.pose[:3, 3]) < 11.1  # eleven steps of a metre
+
+    runs, drive = whole["runs"], whole["drive"]
+    masks = [whole["mask_of"](index, frame) for index, frame in enumerate(drive)]
+    expected = tr.run(drive, masks=masks).poses
+    assert runs.keys() == {"all", "masked"} and np.array_equal(whole["result"].poses, expected)
+
+    result = kept["result"]
+    assert np.array_equal(read_poses("path.txt"), result.poses) and len(result.poses) == 6
+    indices, poses = read_poses_at(Path("path.tum"), kept["drive"].times)
+    assert list(indices) == list(range(6))
+    np.testing.assert_allclose(poses, result.poses, atol=1e-9)
+
+    drawing, steps = cv2.imread("live.png"), live["odometry"].count
+    assert steps == 8 and 15 < (drawing == (0, 0, 255)).all(axis=2).sum() < 9 * steps
+    assert live["step"].flags == [] and 3.4 < live["step"].pose[2, 3] < 3.6  # seven steps
 
     picture = cv2.imread("step.png")
     red, green = ((picture == colour).all(axis=2).sum() for colour in ((0, 0, 255), (0, 255, 0)))

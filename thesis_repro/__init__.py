@@ -1,8 +1,20 @@
-"""A reproduction of a thesis on keypoint masks from segmentation for monocular visual odometry.
+"""Visual odometry with one camera, and keypoint masks from segmentation: a thesis, reproduced.
 
-The main names: Sequence, keypoint_mask, LabelMasks, Odometry, OdometrySettings, THESIS, run,
-metrics, build_unet and InputError. Names are imported on first use. Every detector of
-odometry.keypoints.DETECTORS is a name as well. TensorFlow is loaded when build_unet is called.
+    import thesis_repro as tr
+
+    drive = tr.Sequence("world/kitti", 0)  # tr.Sequence.from_arrays: frames in memory
+    runs = {
+        "all": (tr.THESIS, None),
+        "masks": (tr.THESIS, tr.LabelMasks("labels", drive, 10)),
+        "few": (tr.OdometrySettings(detector=tr.spread(200), estimator=tr.refined), None),
+    }
+    for name, result in tr.run_many(drive, runs).items():  # tr.run: a single run
+        print(name, tr.metrics.rmse(result.poses, drive.poses), result)
+        result.write_kitti(f"{name}.txt")
+
+Detectors: spread, filled, filtered, orb; without one, Shi-Tomasi as in the thesis. Odometry takes
+one frame at a time. keypoint_mask makes a mask from a label map. InputError says what to do.
+Names are imported on first use, TensorFlow when build_unet is called. Recipes: docs/own-masks.md.
 """
 
 from importlib.metadata import version

@@ -50,6 +50,7 @@ def called(name, value):
 
 def of_python():
     names = [*tr.__all__, "Odometry.step", "Sequence.from_arrays"]
+    names += ["Result.write_kitti", "Result.write_tum"]
     names += [f"SequenceLike.{name}" for name in vars(tr.SequenceLike) if name[0] != "_"]
     for name, value in inspect.getmembers(tr.metrics, inspect.isfunction):
         if value.__module__ == tr.metrics.__name__ and name[0] != "_":

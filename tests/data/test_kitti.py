@@ -27,6 +27,8 @@ def test_reads_a_sequence(tiny_kitti):
     short = sequence.subset(2)
     assert len(short) == len(short.poses) == len(short.times) == 2
     assert len(sequence.subset(99)) == len(sequence.subset(None)) == 4
+    with pytest.raises(InputError, match="subset"):
+        sequence[:2]
 
 
 def test_colour_jpeg_frames_are_read_as_gray_with_the_colour_camera(tiny_kitti):

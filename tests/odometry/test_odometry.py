@@ -15,6 +15,7 @@ from street import Street, Stripes
 from reference_steps import estimated, matched_points
 from thesis_repro import odometry
 from thesis_repro.data.kitti import Sequence
+from thesis_repro.data.trajectories import read_poses
 from thesis_repro.errors import InputError
 from thesis_repro.masks.folders import MaskFolder
 from thesis_repro.odometry import (
@@ -514,7 +515,7 @@ def variants():
         "kept": (replace(SMALL, redetect_below=450), None),  # tracks fractional positions on
         "filter": (replace(SMALL, detector=keypoints.filtered, min_distance=4.5), Stripes(40)),
         "orb": (replace(SMALL, detector=keypoints.orb), Stripes(40)),
-        "empty": (THESIS, [BLACK] * 10),
+        "empty": (THESIS, lambda index, frame: BLACK),
     }
 
 
@@ -651,10 +652,44 @@ def test_a_long_run_takes_faster_calls_with_the_same_bits(drive, monkeypatch):
 @pytest.mark.parametrize("make", [odometry.run, odometry.run_many])
 def test_wrong_sequences_and_masks_are_named_before_a_frame_is_read(drive, make):
     unread = Changed(drive)
-    for masks in (lambda index: None, iter(()), [None] * 9):
+    mask = np.full(drive.frame(0).shape, 255, np.uint8)
+    for masks in (7, iter(()), (len(drive) - 1) * [mask], (len(drive) + 1) * [mask]):
         arguments = (THESIS, masks) if make is odometry.run else ({"": (THESIS, masks)},)
         with pytest.raises(InputError, match="masks: "):
             make(unread, *arguments)
         with pytest.raises(InputError, match="sequence: "):
             make("00", *arguments)
     assert unread.read == []
+
+
+def test_masks_may_be_a_function_that_is_called_once_a_frame(drive):
+    stripes, called = Stripes(40), []
+
+    def mask_of(index, frame):
+        assert np.array_equal(frame, drive.frame(index))
+        frame[:] = 0  # its own copy
+        called.append(index)
+        return stripes[index]
+
+    expected = odometry.run(drive, masks=stripes).poses
+    assert np.array_equal(odometry.run(drive, masks=mask_of).poses, expected)
+    runs = {name: (THESIS, mask_of) for name in "ab"} | {"c": (THESIS, None)}
+    results = odometry.run_many(drive, runs)
+    assert called == 2 * list(range(len(drive)))
+    assert np.array_equal(results["a"].poses, expected)
+    assert not np.array_equal(results["c"].poses, expected)
+
+
+def test_a_result_writes_its_path_and_tells_it_in_a_few_lines(drive, tmp_path):
+    result = odometry.run(drive, keep_steps=True)
+    assert len(repr(result).splitlines()) == 3 and f"{len(drive)} frames" in repr(result)
+    for step in result.steps:
+        assert len(repr(step).splitlines()) == 3 and f"frame {step.frame}," in repr(step)
+    with pytest.raises(InputError, match="path.tum"):  # this street has no times
+        result.write_tum(tmp_path / "path.tum")
+    assert not list(tmp_path.iterdir())
+    result.write_kitti(tmp_path / "path.txt")
+    assert np.array_equal(read_poses(tmp_path / "path.txt"), result.poses)
+    times = 2 + 0.5 * np.arange(len(drive))
+    replace(result, times=times).write_tum(tmp_path / "path.tum")
+    assert np.array_equal(np.loadtxt(tmp_path / "path.tum")[:, 0], times)

@@ -94,7 +94,6 @@ def odometry(options: Any) -> None:
     with redirect_stdout(sys.stderr):  # evo prints a line when it first writes its own settings
         import evo.main_ape  # noqa: F401
     from thesis_repro import checks, odometry
-    from thesis_repro.data.trajectories import write_kitti_poses, write_tum
     from thesis_repro.odometry import metrics
     from thesis_repro.odometry.estimators import ESTIMATORS
 
@@ -114,9 +113,9 @@ def odometry(options: Any) -> None:
     _warn(_check_masks(sequence, filter(None, [masks])))
     result = odometry.run(sequence, settings, masks, description=f"sequence {sequence.name}")
     if options.output:
-        write_kitti_poses(options.output, result.poses)
+        result.write_kitti(options.output)
     if options.tum:
-        write_tum(options.tum, result.poses, sequence.times)
+        result.write_tum(options.tum)
     steps = len(sequence), result.failed_steps, result.dropped_steps
     standing = checks.standing(sequence)
     _warn(checks.run_warnings(sequence.name, *steps, settings.scale_gate, standing))

@@ -270,6 +270,10 @@ class Sequence:
         return cameras.undistorted(image, self.lens)
 
     def __getitem__(self, index: int) -> np.ndarray:
+        if isinstance(index, slice):
+            raise InputError(
+                f"sequence {self.name}: takes no slice; subset(n) has the first n frames"
+            )
         return self.frame(operator.index(index))
 
     def __iter__(self) -> Iterator[np.ndarray]:

@@ -1,20 +1,21 @@
 """Run the odometry over a sequence: one run, or many runs in one pass, which share their work."""
 
 import time
-from collections.abc import Mapping, Sequence, Sized
+from collections.abc import Callable, Mapping, Sequence, Sized
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import pandas as pd
 
 from thesis_repro.data.memory import SequenceLike
+from thesis_repro.data.trajectories import write_kitti_poses, write_tum
 from thesis_repro.errors import InputError
 from thesis_repro.odometry.inputs import EQUAL
 from thesis_repro.odometry.loop import STATIONARY, Calls, Odometry
 from thesis_repro.odometry.settings import THESIS, OdometrySettings
 from thesis_repro.odometry.step import FRAME_COLUMNS, ROTATION_COLUMNS, TIMED_PARTS, Step
-from thesis_repro.running import program
 from thesis_repro.running.files import progress
 
 # Frames from which faster calls with OpenCV's bits pay. To load them takes 2 s, to compile 25 s;
@@ -34,19 +35,49 @@ class Masks(Protocol):
     def __getitem__(self, index: int, /) -> np.ndarray: ...
 
 
+MasksOrFunction = Masks | Callable[[int, np.ndarray], np.ndarray]
+
+
 @dataclass(frozen=True, eq=False)
 class Result:
     """Result of one run.
 
     poses: estimated path, (n, 4, 4), camera to world, metres. frames: a table with one row a frame,
     see Step.row; missing values are blank. steps: of `run(..., keep_steps=True)`, one Step a frame.
-    A result equals only itself; compare poses with np.array_equal.
+    times: of the frames, (n,), seconds; None if the sequence has none. A result equals only itself;
+    compare poses with np.array_equal.
     """
 
     poses: np.ndarray
     frames: pd.DataFrame
     settings: OdometrySettings = THESIS
     steps: Sequence[Step] = ()
+    times: np.ndarray | None = None
+
+    def __repr__(self) -> str:
+        means = self.frames[["detected", "tracked", "inliers"]].astype(float).mean()
+        path = np.linalg.norm(np.diff(self.poses[:, :3, 3], axis=0), axis=1).sum()
+        return (
+            f"Result: {len(self.poses)} frames, a path of {path:.2f} m\n"
+            f"  mean of a frame: {means['detected']:.0f} keypoints detected, "
+            f"{means['tracked']:.0f} points tracked, {means['inliers']:.0f} inliers\n"
+            f"  flags: {self.flagged.to_dict() or 'none'}"
+        )
+
+    def write_kitti(self, path: str | Path) -> None:
+        """Write the poses in KITTI's format: 12 numbers a line, one line a frame."""
+        write_kitti_poses(path, self.poses)
+
+    def write_tum(self, path: str | Path) -> None:
+        """Write the poses in TUM's format: time, position, quaternion (x, y, z, w) a line.
+
+        Raises InputError if the sequence has no times.
+        """
+        if self.times is None:
+            raise InputError(
+                f"{path}: TUM's format needs the sequence's times; write_kitti does not"
+            )
+        write_tum(path, self.poses, self.times)
 
     @property
     def flagged(self) -> pd.Series:
@@ -85,19 +116,20 @@ def start_pose(sequence: SequenceLike) -> np.ndarray:
 def run(
     sequence: SequenceLike,
     settings: OdometrySettings = THESIS,
-    masks: Masks | None = None,
+    masks: MasksOrFunction | None = None,
     description: str | None = None,
     calls: Calls | None = None,
     keep_steps: bool = False,
 ) -> Result:
     """Run the odometry over a sequence. Returns a Result.
 
-    masks: see Masks. description: text of the progress bar; None for no bar. calls: functions in
+    masks: see Masks; or a function of the frame's number and the frame, such as a detector, that
+    returns the mask. description: text of the progress bar; None for no bar. calls: functions in
     place of OpenCV's, see loop.Calls. Without them, a long run takes faster ones with the same
     bits. keep_steps: keep each Step, with its keypoints and matches, in Result.steps; without
     masks, about 150 kB a frame.
     Raises InputError if a frame cannot be read, if a mask and its frame differ in size, if there
-    are fewer masks than frames, and for another kind of sequence, settings or masks.
+    are more or fewer masks than frames, and for another kind of sequence, settings or masks.
     """
     check(sequence, masks)
     calls = calls or _faster_calls(len(sequence))
@@ -106,12 +138,12 @@ def run(
     rows, steps = [], []
     for index in progress(range(len(sequence)), description):
         frame = sequence.frame(index)
-        mask, mask_seconds = _mask_of_frame(masks, index, sequence.visible(index))
+        mask, mask_seconds = _mask_of_frame(masks, index, frame, sequence.visible(index))
         step = odometry.step(frame, step_lengths[index], mask)
         rows.append([*step.row().values(), mask_seconds])
         if keep_steps:
             steps.append(step)
-    return _result(rows, settings, steps)
+    return _result(sequence, rows, settings, steps)
 
 
 def _faster_calls(frames: int) -> Calls | None:
@@ -132,15 +164,16 @@ def _faster_calls(frames: int) -> Calls | None:
 
 def run_many(
     sequence: SequenceLike,
-    runs: Mapping[Any, tuple[OdometrySettings, Masks | None]],
+    runs: Mapping[Any, tuple[OdometrySettings, MasksOrFunction | None]],
     description: str | None = None,
     failed: dict[Any, str] | None = None,
 ) -> dict[Any, Result]:
     """Make many runs, {name: (settings, masks)}, over one sequence. Returns {name: Result}.
 
-    The results equal those of separate runs. What several runs ask for is done once: frames are
-    decoded, corner strengths computed, points tracked, and equal matches searched for an essential
-    matrix. OpenCV's search and vote are replaced by faster ones with the same bits (opencv_exact).
+    masks: as in `run`. The results equal those of separate runs. What several runs ask for is done
+    once: frames are decoded, a function of masks called, corner strengths computed, points tracked,
+    and equal matches searched for an essential matrix. OpenCV's search and vote are replaced by
+    faster ones with the same bits (opencv_exact).
     The times of the four calls are blank, because they cannot be measured for a single run.
     failed: gets {name: reason} of runs that a mask or keypoints end, and the others go on. Without
     it, the first such InputError is raised.
@@ -166,7 +199,7 @@ def run_many(
             masks = runs[name][1]
             try:
                 if id(masks) not in made:
-                    made[id(masks)] = _mask_of_frame(masks, index, visible)
+                    made[id(masks)] = _mask_of_frame(masks, index, frame, visible)
                 mask, mask_seconds = made[id(masks)]
                 step = odometry.step(frame, step_lengths[index], mask)
             except InputError as error:
@@ -177,15 +210,19 @@ def run_many(
                 continue
             step.seconds = dict.fromkeys(TIMED_PARTS, np.nan)
             rows[name].append([*step.row().values(), mask_seconds])
-    return {name: _result(rows[name], runs[name][0]) for name in odometries}
+    return {name: _result(sequence, rows[name], runs[name][0]) for name in odometries}
 
 
 def _mask_of_frame(
-    masks: Masks | None, index: int, visible: np.ndarray | None
+    masks: MasksOrFunction | None, index: int, frame: np.ndarray, visible: np.ndarray | None
 ) -> tuple[np.ndarray | None, float]:
     """The mask of a frame, within what is visible, and the seconds to make it."""
     started = time.perf_counter()
-    mask = None if masks is None else masks[index]
+    mask = None
+    if isinstance(masks, Masks):
+        mask = masks[index]
+    elif masks is not None:
+        mask = masks(index, np.array(frame))  # which the function may draw on
     seconds = time.perf_counter() - started
     return inside(visible, mask), seconds
 
@@ -200,27 +237,32 @@ def inside(visible: np.ndarray | None, mask: Any) -> Any:
 
 
 def check(sequence: Any, masks: Any) -> None:
-    """Raise InputError unless a sequence is one, and its masks are enough masks or None."""
+    """Raise InputError unless a sequence is one, and its masks are one a frame or None."""
     missing = [name for name in NEEDED if name not in dir(sequence)]
     if missing:
         raise InputError(
             f"sequence: must be a thesis_repro.Sequence, not {type(sequence).__name__}, which lacks "
             f"{', '.join(missing)} (see thesis_repro.SequenceLike)"
         )
-    is_short = isinstance(masks, Sized) and len(masks) < len(sequence)
-    if is_short or not isinstance(masks, Masks | None):
-        raise InputError(f"masks: must be {len(sequence)} masks, one a frame, such as LabelMasks")
-    if isinstance(masks, Sized) and len(masks) > len(sequence):
-        program.log.warning(
-            f"masks: {len(masks)} for {len(sequence)} frames; the first ones are taken, so they must belong "
-            "to the same first frame"
+    has_length = isinstance(masks, Sized)
+    if has_length and len(masks) != len(sequence):
+        raise InputError(f"masks: {len(masks)} for {len(sequence)} frames; must be one a frame")
+    if not isinstance(masks, Masks | None) and (has_length or not callable(masks)):
+        raise InputError(
+            f"masks: must be {len(sequence)} masks, one a frame, such as LabelMasks, or a function "
+            "of the frame's number and the frame"
         )
 
 
-def _result(rows: list[list], settings: OdometrySettings, steps: Sequence[Step] = ()) -> Result:
+def _result(
+    sequence: SequenceLike,
+    rows: list[list],
+    settings: OdometrySettings,
+    steps: Sequence[Step] = (),
+) -> Result:
     frames = pd.DataFrame(rows, columns=[*FRAME_COLUMNS, "mask_seconds"])
     frames = frames.astype(dict.fromkeys(COUNTS, "Int64"))
-    return Result(poses_of(frames), frames, settings, steps)
+    return Result(poses_of(frames), frames, settings, steps, getattr(sequence, "times", None))
 
 
 def poses_of(frames: pd.DataFrame) -> np.ndarray:

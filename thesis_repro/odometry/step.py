@@ -103,6 +103,16 @@ class Step:
     flags: list[str] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(TIMED_PARTS, 0.0))
 
+    def __repr__(self) -> str:
+        x, y, z = self.pose[:3, 3]
+        tracked, inliers = len(self.current), self.inliers.sum()
+        return (
+            f"Step: frame {self.frame}, {self.scale:.2f} m after the one before\n"
+            f"  {self.points or 0} points, {tracked} tracked, {inliers} inliers; "
+            f"{self.detected or 0} new keypoints\n"
+            f"  position ({x:.2f}, {y:.2f}, {z:.2f}) m; flags: {', '.join(self.flags) or 'none'}"
+        )
+
     @property
     def inliers(self) -> np.ndarray:
         """Matches that agree with the essential matrix, (N,) booleans."""
