@@ -542,9 +542,9 @@ def counted(monkeypatch, module, name):
     """A list that gets an entry at each call of a function from now on."""
     calls, original = [], getattr(module, name)
 
-    def counting(*arguments):
+    def counting(*arguments, **options):
         calls.append(arguments)
-        return original(*arguments)
+        return original(*arguments, **options)
 
     monkeypatch.setattr(module, name, counting)
     return calls
