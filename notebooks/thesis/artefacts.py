@@ -13,10 +13,12 @@ import street_world
 from keypoint_study.report import style
 from thesis.settings import Settings, read_settings
 from thesis_repro.data import kitti
-from thesis_repro.running import files, program
+from thesis_repro.errors import InputError
+from thesis_repro.running import files, program, provenance
 
-LABELS_BY = "labels_by.txt"  # in the folder of the run: who made the label maps
+LABELS_BY = "labels_by.txt"  # in the folder of the run, for people: who made the label maps
 IN_PACKAGE = "the model in the package"
+NETWORK_IN_PACKAGE = "11a5270f8fd2"  # its digest in records of label maps, without TensorFlow
 
 
 def begin() -> Settings:
@@ -37,49 +39,97 @@ def needed(name: str, notebook: str) -> Path:
     return files.needed(read_settings().build / name, notebook)
 
 
-def used_model() -> Any:
-    """Load the model that made the label maps of the run."""
+def model_of_run() -> Any:
+    """Load the model that notebook 5 uses: the trained one, or that in the package if none is.
+
+    Raises InputError with the name of notebook 4 if it was not run.
+    """
     from thesis_repro.segmentation import quietly
 
     with quietly():  # what TensorFlow prints when it starts is no error
         from thesis_repro.segmentation import prediction, training
     settings = read_settings()
-    if settings.uses_shipped_model or _by_model_in_package(settings):
+    if settings.uses_shipped_model:
         return prediction.load_shipped()
     return training.load_model(needed("model/model.keras", "04_training"))
 
 
-def predict_with_model_in_package() -> None:
-    """Do what notebook 5 does, with the model in the package: a notebook is opened first.
+def used_model() -> Any:
+    """Load the model that made the label maps of the run.
 
-    The embedded world is rendered if it is used. Notebook 5 replaces the label maps.
+    Raises InputError if it is neither the model of the run nor that in the package.
     """
     from thesis_repro.segmentation import quietly
 
-    with quietly():  # what TensorFlow prints when it starts is no error
-        from thesis_repro.segmentation import prediction
+    with quietly():
+        from thesis_repro.segmentation import prediction, training
+    network = _network_of_label_maps()
+    if network == NETWORK_IN_PACKAGE:
+        return prediction.load_shipped()
+    model = model_of_run()
+    if network != training.weights_digest(model):
+        raise InputError(
+            f"{read_settings().build / 'labels'}: not by the network of this run, which was trained again; "
+            "run notebook 05_prediction again"
+        )
+    return model
+
+
+def ensure_label_maps() -> None:
+    """Do what notebook 5 does, with the model in the package, unless it was run: 6 comes first.
+
+    The embedded world is rendered if it is used. Notebook 5 replaces the label maps.
+    """
     settings = read_settings()
+    if _network_of_label_maps() not in (None, NETWORK_IN_PACKAGE):
+        return
     if settings.kitti_is_embedded:
         world = settings.sizes.world | {"seed": settings.seed, "jobs": settings.jobs}
         street_world.write(settings.world, **world, only="kitti", replace=True)
-    model = prediction.load_shipped()
+    missing = {}
     for name in kitti.sequences(settings.kitti):
-        drive = kitti.Sequence(settings.kitti, name).subset(settings.sizes.frames)
-        prediction.write_label_maps(model, drive.frame_paths, settings.build / "labels" / name)
+        paths = kitti.Sequence(settings.kitti, name).subset(settings.sizes.frames).frame_paths
+        folder = settings.build / "labels" / name
+        if not all((folder / f"{path.stem}.png").is_file() for path in paths):
+            missing[folder] = paths
+    if not missing:
+        return
+    from thesis_repro.segmentation import quietly
+
+    with quietly():
+        from thesis_repro.segmentation import prediction
+    model = prediction.load_shipped()
+    for folder, paths in missing.items():
+        prediction.write_label_maps(model, paths, folder)
     write_text(LABELS_BY, IN_PACKAGE)
 
 
-def data_note() -> str:
-    """Return what figures and tables say about the data of the run, and of its label maps."""
+def data_note(whose: str = "") -> str:
+    """Return what figures and tables say about the data of the run, and of its label maps.
+
+    whose: the model that is to make them; by default the record of those in the folder tells.
+    """
     settings = read_settings()
-    if _by_model_in_package(settings) and not settings.uses_shipped_model:
+    if settings.uses_shipped_model:
+        return settings.data_note
+    if whose == IN_PACKAGE or (not whose and _network_of_label_maps() == NETWORK_IN_PACKAGE):
         return f"{settings.data_note}; label maps: by {IN_PACKAGE}"
     return settings.data_note
 
 
-def _by_model_in_package(settings: Settings) -> bool:
-    made_by = settings.build / LABELS_BY
-    return made_by.is_file() and made_by.read_text() == IN_PACKAGE
+def _network_of_label_maps() -> str | None:
+    """Return the digest of the network that made the label maps of the run, or None.
+
+    Their record tells. Raises InputError if two networks did, because a notebook was stopped.
+    """
+    settings = read_settings()
+    labels = settings.build / "labels"
+    names = kitti.sequences(settings.kitti) if labels.is_dir() else []
+    records = [provenance.record(labels / name) for name in names]
+    networks = {record["model"] for record in records if record}
+    if len(networks) > 1:
+        raise InputError(f"{labels}: by two networks; run notebook 05_prediction again, to its end")
+    return min(networks, default=None)
 
 
 def write_text(name: str, text: str) -> None:

@@ -172,7 +172,7 @@ def of_times(settings: Settings) -> list[dict[str, Any]]:
 def of_training(settings: Settings) -> list[dict[str, Any]]:
     """Return rows 7 and 44, from the validation images and the network of notebook 04."""
     data = artefacts.needed("data", "01_load_images_and_labels")
-    model = artefacts.used_model()
+    model = artefacts.model_of_run()
     model.compile(loss=training.total_loss())
     images, label_maps = (np.load(data / f"validation_{x}.npy")[:16] for x in ("images", "labels"))
     blur, full = (

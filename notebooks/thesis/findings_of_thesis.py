@@ -6,7 +6,7 @@ import pandas as pd
 
 from keypoint_study.jobs import CONTROL_WIDTH
 from keypoint_study.report import findings, style, texts
-from thesis import domain_gap, trainings
+from thesis import artefacts, domain_gap, trainings
 from thesis.settings import Settings
 from thesis_repro.running.files import write_text
 
@@ -17,7 +17,8 @@ def notes(settings: Settings, runs: pd.DataFrame, mask_settings: dict[str, Any])
     mask_settings: those that are not the thesis's.
     """
     changed = ", ".join(f"{name} {value}" for name, value in mask_settings.items())
-    note = f"{settings.data_note}; masks: {changed}" if changed else settings.data_note
+    data = artefacts.data_note()
+    note = f"{data}; masks: {changed}" if changed else data
     if settings.kitti_is_embedded:
         return note, "thesis, another data set"
     frames = runs.groupby("sequence")["frames"].first()

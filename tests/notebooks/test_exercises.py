@@ -7,6 +7,7 @@ maps. What holds only in the lab is marked torture.
 import json
 import operator
 import re
+import shutil
 from contextlib import redirect_stdout
 from io import StringIO
 
@@ -25,6 +26,7 @@ from thesis.settings import PREFIX, ROOT, read_settings
 from thesis_repro import masks
 from thesis_repro.data import cityscapes
 from thesis_repro.errors import InputError
+from thesis_repro.running import provenance
 
 # the cells that an edit goes through, without those that only show something
 READING = "02 28 03 09 30 31 36 11 32 13 15"
@@ -33,6 +35,7 @@ NETWORK = "01 02 32 03 15 17 39 19 34"
 LOSS = "01 02 27 03 05 06 08 43 45"
 LOSSES = f"{LOSS} 39 47 40 41"
 MASKS = "01 02 03 05 06 52 08 09 12 13 45 46 54 47 48"
+PREDICTION = "01 02 03 04 06 07 41 15 23"
 LOOP = "01 02 03 04 06 15 18 23 24 39 40 43 44 52 60 80"
 CHOICES = "01 02 03 04 23 52 43 54 55"
 TEXT = "aligned ATE (m)"
@@ -300,7 +303,7 @@ def test_exercise_05_2(executed, small_world, choose):
     own, package = (columns.filter(like=text) for text in ("of this run", "in the package"))
     assert (package.loc["pixel accuracy"].to_numpy() > own.loc["pixel accuracy"].to_numpy()).all()
     choose(KITTI=small_world / "kitti", FRAMES=5)
-    artefacts.predict_with_model_in_package()
+    artefacts.ensure_label_maps()
     kept = []
     sequence = tr.Sequence(small_world / "kitti", "00")
     true = cv2.imread(str(sequence.folder / "labels_0" / sequence.frame_paths[0].name), 0)
@@ -347,6 +350,68 @@ def test_notebook_6_can_be_opened_first_and_7_says_what_to_run(build):
     assert artefacts.data_note().endswith("label maps: by the model in the package")
     with pytest.raises(InputError, match="run notebook 06_keypoint_masks first"):
         run("07", "01 02 03 04 06")
+
+
+def label_maps_by(*edits):
+    """The model with which notebook 5 makes label maps, and what figures say about them."""
+    names = run("05", PREDICTION, *edits)
+    assert artefacts.used_model().input_shape == names["model"].input_shape
+    assert artefacts.data_note() == names["note"]
+    return names["whose"], names["model"].input_shape[1], names["note"]
+
+
+def test_label_maps_are_of_the_model_that_notebook_5_names_in_any_order(images, small_model):
+    (images / "labels").unlink()
+    run("06", "01 02 03 05")  # opened first
+    with pytest.raises(InputError, match="run notebook 04_training first"):
+        run("05", PREDICTION)
+    assert artefacts.data_note().endswith("label maps: by the model in the package")
+    (images / "model").mkdir()
+    shutil.copy(small_model, images / "model")
+    own = "the model of this run", 64, read_settings().data_note
+    package = "the model in the package", 320, f"{own[2]}; label maps: by the model in the package"
+    shipped = "SHIPPED = settings.uses_shipped_model", "SHIPPED = True"
+    ways = [label_maps_by(), label_maps_by(shipped), label_maps_by()]
+    assert ways == [own, package, own]
+    run("06", "01 02 03 05")  # leaves the label maps of notebook 5
+    assert artefacts.data_note() == own[2]
+
+
+def test_label_maps_of_an_earlier_training_or_of_two_networks_are_named(images, small_model):
+    folder = images / "model"
+    folder.mkdir()
+    shutil.copy(small_model, folder)
+    (images / "labels").unlink()
+    label_maps_by()
+    again = artefacts.model_of_run()
+    again.set_weights([weights + 0.1 for weights in again.get_weights()])
+    again.save(folder / "model.keras")
+    with pytest.raises(InputError, match="labels.*05_prediction"):
+        artefacts.used_model()
+    shutil.rmtree(images / "labels/00")  # as if notebook 5 was stopped after its first sequence
+    provenance.stage(images / "labels/00", model="another")
+    for opened in (lambda: run("06", "01 02 03 05"), artefacts.used_model, artefacts.data_note):
+        with pytest.raises(InputError, match="labels.*two networks.*05_prediction"):
+            opened()
+    assert [label_maps_by()[0] for _ in range(2)] == ["the model of this run"] * 2
+
+
+def test_the_digest_of_the_model_in_the_package():
+    from thesis_repro.segmentation import prediction, training
+
+    digest = training.weights_digest(prediction.load_shipped())
+    assert digest == artefacts.NETWORK_IN_PACKAGE
+
+
+def test_label_maps_by_the_model_in_the_package_are_made_to_the_end(build):
+    (build / "labels").unlink()
+    artefacts.ensure_label_maps()
+    maps = sorted((build / "labels").glob("*/*.png"))
+    before = [path.read_bytes() for path in maps]
+    for path in maps[3:]:  # as if the notebook was stopped
+        path.unlink()
+    artefacts.ensure_label_maps()
+    assert [path.read_bytes() for path in maps] == before and len(before) == 10
 
 
 def test_your_loop_stands_beside_the_thesiss(build):
