@@ -132,7 +132,23 @@ def test_a_camera_that_stands_is_told(tiny_kitti):
 
 STREET = np.repeat([[23], [11], [7]], 16, axis=0).repeat(64, axis=1).astype(np.uint8)
 TRAIN = np.choose(STREET // 8, [0, 2, 10]).astype(np.uint8)
+SYNTHIA = np.choose(STREET // 8, [3, 2, 1]).astype(np.uint8)
+CAMVID = np.choose(STREET // 8, [3, 1, 0]).astype(np.uint8)
 HALF = np.repeat([[0, 255]], 48, axis=0).repeat(32, axis=1).astype(np.uint8)
+
+
+@pytest.mark.parametrize("split", ["train", "val"])
+@pytest.mark.parametrize(
+    "label_map, said",
+    [(STREET, None), (CAMVID, "above 3"), (TRAIN, "above 10"), (STREET + 3, "rail")],
+)
+def test_training_label_maps_of_other_ids_are_told(tiny_cityscapes, capsys, split, label_map, said):
+    for path in (tiny_cityscapes / f"{split}annot").iterdir():
+        small = cv2.resize(label_map, (32, 16), interpolation=cv2.INTER_NEAREST)
+        cv2.imwrite(str(path), small)
+    assert checks.check_cityscapes(tiny_cityscapes) == []
+    told = [line for line in capsys.readouterr().out.splitlines() if "label maps hold" in line]
+    assert [f"split {split}: " in line and said in line for line in told] == [True] * bool(said)
 
 
 @pytest.mark.parametrize(
@@ -141,6 +157,8 @@ HALF = np.repeat([[0, 255]], 48, axis=0).repeat(32, axis=1).astype(np.uint8)
         ("labels", STREET, {}, None),
         ("labels", TRAIN, {}, "--ids train"),
         ("labels", TRAIN, {"ids": "train"}, None),
+        ("labels", SYNTHIA, {}, "no id above 3, so no sky, vegetation or cars; --ids FILE"),
+        ("labels", CAMVID, {}, "no id above 3, so no sky, vegetation or cars; --ids FILE"),
         ("labels", STREET + 11, {}, "KITTI-360"),
         ("labels", STREET + 3, {"ids": "vistas-1.2"}, "33% parking"),
         ("labels", 0 * STREET + 23, {}, "nothing but sky"),

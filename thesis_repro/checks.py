@@ -8,6 +8,7 @@ import sys
 import zlib
 from collections.abc import Callable, Collection, Iterable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -17,6 +18,7 @@ import numpy as np
 
 from thesis_repro.data import cityscapes, kitti
 from thesis_repro.data.geometry import centre_doubt
+from thesis_repro.data.ids import LABEL_IDS
 from thesis_repro.data.memory import are_impossible
 from thesis_repro.errors import InputError, one_line
 from thesis_repro.masks import coverage
@@ -104,6 +106,10 @@ def check_cityscapes(root: Path, splits: Iterable[str] = ("train", "val")) -> li
             problems.append(str(error))
             continue
         print(f"  split {split}: {len(pairs)} images with label maps")
+        sampled = [pairs[index].label for index in _sample(len(pairs))]
+        with suppress(InputError):  # of a damaged one, which is told below
+            told = _label_map_doubts(list(map(cityscapes.read_label_map, sampled)))
+            print("".join(f"  split {split}: {text}\n" for text in told[:1]), end="")
         problems += _damaged(read_pair, pairs, f"split {split}")
     return sorted(problems)
 
@@ -215,19 +221,46 @@ def look_at_masks(
     what is certainly wrong. Raises InputError if one of them cannot be read.
     """
     folder = source.paths[0].parent
-    sampled = np.unique(np.linspace(0, len(source) - 1, MASK_SAMPLES).astype(int)).tolist()
+    sampled = _sample(len(source))
     shares = [coverage(source[index]) for index in sampled]
     line = f"{folder}: masks keep {np.mean(shares):.1%} of {sequence.name}"
-    of_classes, has_label_ids = np.ones(cityscapes.N_CLASSES), False
+    told = []
     if isinstance(source, LabelMasks):
-        of_classes, has_label_ids = _class_shares(source, sampled), source.settings.ids == "labels"
+        label_maps = [source.label_map(index) for index in sampled]
+        of_classes = _class_shares(label_maps)
+        told = _label_map_doubts(label_maps, source.settings.ids)
         if source.dilation_width is not None:
             line += f" (width {source.dilation_width})"
         classes = zip(cityscapes.LABELS, of_classes, strict=False)
         held = [f"{label.name} {share:.0%}" for label, share in classes if share >= MIN_SHARE]
         line += f"; label maps hold {', '.join(held)}"
+    if min(shares) < MIN_SHARE or min(shares) == 1:
+        told.append(
+            f"masks keep {min(shares):.1%} to {max(shares):.1%} of the frames; --invert inverts ready-made "
+            "masks"
+        )
+    return line, [f"{folder}: {text}" for text in told[:1]]
+
+
+def _sample(count: int) -> list[int]:
+    """Return about MASK_SAMPLES of so many numbers, spread evenly over them."""
+    return np.unique(np.linspace(0, count - 1, MASK_SAMPLES).astype(int)).tolist()
+
+
+def _label_map_doubts(label_maps: list[np.ndarray], ids_option: str | None = None) -> list[str]:
+    """Return what is certainly wrong with label maps of a street, the worst first.
+
+    ids_option: what they were read with; None for those of a training, which has no such option.
+    """
+    has_label_ids = ids_option in (None, LABEL_IDS)
+    of_classes = _class_shares(label_maps)
     ids = np.flatnonzero(of_classes)
     seldom = max(SELDOM, key=lambda label: of_classes[label.id])
+    advice = "--ids FILE gives ids the names that are meant"
+    if ids_option is None:
+        advice = "a training needs Cityscapes' label ids"
+    elif ids.max() < len(cityscapes.TRAINED) and _is_street_of_train_ids(label_maps):
+        advice = "--ids train reads train ids"
     told = [
         (
             len(ids) == 1,
@@ -236,30 +269,31 @@ def look_at_masks(
         ),
         (
             has_label_ids and ids.max() < len(cityscapes.TRAINED),
-            f"label maps hold no id above {ids.max()}, so no sky, vegetation or cars; --ids train reads "
-            "train ids",
+            f"label maps hold no id above {ids.max()}, so no sky, vegetation or cars; {advice}",
         ),
         (
             has_label_ids and ids.max() == cityscapes.ID["license plate"],
-            f"label maps hold id {ids.max()}, a license plate, but a garage in KITTI-360; --ids FILE gives "
-            "ids the names that are meant",
+            f"label maps hold id {ids.max()}, a license plate, but a garage in KITTI-360; {advice}",
         ),
         (
             MAX_SELDOM < of_classes[seldom.id] < 1,
             f"label maps hold {of_classes[seldom.id]:.0%} {seldom.name}, which streets seldom have; do they "
-            "have other ids than --ids says?",
-        ),
-        (
-            min(shares) < MIN_SHARE or min(shares) == 1,
-            f"masks keep {min(shares):.1%} to {max(shares):.1%} of the frames; --invert inverts ready-made "
-            "masks",
+            "have other ids?",
         ),
     ]
-    return line, [f"{folder}: {text}" for applies, text in told if applies][:1]
+    return [text for applies, text in told if applies]
 
 
-def _class_shares(source: LabelMasks, sampled: list[int]) -> np.ndarray:
-    """Return the share of each label id, (N_CLASSES,), in the sampled label maps."""
-    label_maps = [source.label_map(index).ravel() for index in sampled]
-    counts = np.bincount(np.concatenate(label_maps), minlength=cityscapes.N_CLASSES)
-    return counts / counts.sum()
+def _is_street_of_train_ids(label_maps: list[np.ndarray]) -> bool:
+    """Return whether ids read as train ids show a road below, and something else above it."""
+    upper, lower = (
+        np.bincount(np.concatenate([half.ravel() for half in halves])).argmax()
+        for halves in zip(*(np.array_split(label_map, 2) for label_map in label_maps))
+    )
+    return cityscapes.TRAINED[lower] == "road" != cityscapes.TRAINED[upper]
+
+
+def _class_shares(label_maps: list[np.ndarray]) -> np.ndarray:
+    """Return the share of each label id, (N_CLASSES,), in label maps."""
+    pixels = np.concatenate([label_map.ravel() for label_map in label_maps])
+    return np.bincount(pixels, minlength=cityscapes.N_CLASSES) / pixels.size

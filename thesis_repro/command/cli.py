@@ -57,6 +57,8 @@ def predict(options: Any) -> None:
     """
     from thesis_repro.segmentation import quietly
 
+    if options.preprocess and options.scale != 1:
+        raise InputError("--preprocess, --scale: give one of them; --preprocess scales, too")
     images = _image_folders(options.images, options.calibration)
     _check_outputs(options, options.images)
     with quietly():  # this import takes seconds, so the files are checked first
@@ -67,8 +69,10 @@ def predict(options: Any) -> None:
         output = options.folder
         if folder != options.images:  # one of several sequences
             output /= folder.name
-        paths, scale = paths[: options.frames], float(options.scale)
-        new = prediction.write_label_maps(model, paths, output, scale=scale, lens=lens)
+        paths, how = paths[: options.frames], {"scale": options.scale, "lens": lens}
+        new = prediction.write_label_maps(
+            model, paths, output, preprocess=options.preprocess, **how
+        )
         reused += len(paths) - new
         lines.append(f"{output}: {len(paths)} label maps")
     program.summary("\n".join(lines), reused)

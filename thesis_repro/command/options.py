@@ -4,7 +4,6 @@ import argparse
 import os
 from collections.abc import Callable, Collection
 from difflib import get_close_matches
-from fractions import Fraction
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -235,10 +234,15 @@ COMMANDS: dict[str, dict[str, Any]] = {
             help="trained model, .keras or .hdf5 (the model in the package)",
         ),
         "--scale": dict(
-            type=Fraction,
+            type=values.positive_factor,
             default=1,
             metavar="FACTOR",
             help="multiply gray values, 0 to 255, by this; 1/255 for a model that wants 0 to 1 (1)",
+        ),
+        "--preprocess": dict(
+            choices=["tf", "torch", "caffe"],
+            help="instead of --scale, what Keras' applications want: tf for -1 to 1; torch and caffe take out "
+            "the mean colour of ImageNet (gray values from 0 to 255)",
         ),
     },
     "masks": {

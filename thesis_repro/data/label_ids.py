@@ -6,6 +6,7 @@ file for each table with a name.
 """
 
 import csv
+import re
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from thesis_repro.running.files import read_color, read_ids
 from thesis_repro.running.provenance import digest_of_file
 
 NOT_NAMED = 255  # no label id
+LARGEST = {False: 0xFFFF, True: 0xFFFFFF}  # id of 16 bits, and colour
 RGB = np.array([1 << 16, 1 << 8, 1])  # makes one number of a colour
 
 
@@ -33,20 +35,29 @@ def read_table(ids: str | Path) -> tuple[bool, dict[int, int]]:
             f"--ids {ids}: must be {', '.join(names())}, or a file, which is not there"
         )
     lines = read_text(path).split("\n")
-    table = {}
+    table: dict[int, int] = {}
+    kinds = set()
     for number, row in enumerate(csv.reader(lines), 1):
         if not row or row[0] in ("id", "color"):
             continue
         try:
             key, name = map(str.strip, row)
-            base = 16 if key.startswith("#") else 10
-            table[int(key.removeprefix("#"), base)] = ID[name]
+            is_color = re.fullmatch("#[0-9a-fA-F]{6}", key) is not None
+            value = int(key.removeprefix("#"), 16) if is_color else int(key)
+            label = ID[name]
         except (ValueError, KeyError):
             raise InputError(
-                f"{path}, line {number}: must hold an id or a colour (#464646), a comma and one of "
-                f"{', '.join(ID)}"
+                f"{path}, line {number}: must hold an id or a colour of six digits (#464646), a comma and "
+                f"one of {', '.join(ID)}"
             ) from None
-    return any(line.startswith("#") for line in lines), table
+        kinds.add(is_color)
+        if value in table or len(kinds) > 1 or not -1 <= value <= LARGEST[is_color]:
+            raise InputError(
+                f"{path}, line {number}: {key} must stand there once, be at most {LARGEST[False]}, and "
+                "either all lines name ids or all name colours"
+            )
+        table[value] = label
+    return True in kinds, table
 
 
 def record(ids: str | Path) -> dict[str, str]:

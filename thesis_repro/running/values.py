@@ -4,12 +4,23 @@ Each function raises ValueError for a text of another kind, and its name says in
 is wanted.
 """
 
+import math
+
 
 def positive_whole_number(text: str) -> int:
     """Return the whole number from 1 on in a text."""
     if int(text) < 1:
         raise ValueError
     return int(text)
+
+
+def positive_factor(text: str) -> float:
+    """Return the number above zero in a text, such as "0.5" or "1/255"."""
+    above, _, below = text.partition("/") if "/" in text else (text, "", "1")
+    factor = float(above) / (float(below) or math.nan)
+    if not 0 < factor < math.inf:
+        raise ValueError
+    return factor
 
 
 def number_of_frames(text: str) -> int | None:

@@ -9,6 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 import tensorflow as tf
+from keras.applications.imagenet_utils import preprocess_input
 
 from thesis_repro import segmentation
 from thesis_repro.data.cameras import Camera
@@ -33,16 +34,23 @@ def load_shipped() -> Any:
     return training.load_model(SHIPPED)
 
 
-def predict(model: Any, images: np.ndarray, batch_size: int = 16, scale: float = 1.0) -> np.ndarray:
+def predict(
+    model: Any,
+    images: np.ndarray,
+    batch_size: int = 16,
+    scale: float = 1.0,
+    preprocess: str | None = None,
+) -> np.ndarray:
     """Return the label maps of images.
 
     images: (n, height, width, channels) uint8, of the model's input size. Label maps: (n, height,
     width) uint8. The class of a pixel is the most probable one.
     scale: factor of the gray values 0 to 255 before the network, 1/255 for one that wants 0 to 1.
+    preprocess: instead, the mode of Keras' `preprocess_input`: "tf" (-1 to 1), "torch", "caffe".
     Raises InputError for images of another shape or type.
     """
     training.check_images(images, model.input_shape)
-    run = _compiled(model, scale)
+    run = _compiled(model, scale, preprocess)
     labels = np.empty(images.shape[:3], np.uint8)
     for start in files.progress(range(0, len(images), batch_size), "predicting", unit="batch"):
         labels[start : start + batch_size] = run(images[start : start + batch_size])
@@ -56,13 +64,14 @@ def write_label_maps(
     batch_size: int = 16,
     scale: float = 1.0,
     lens: Camera | None = None,
+    preprocess: str | None = None,
 ) -> int:
     """Write the label map of each image as output_dir/NAME.png (A.7.2).
 
     Label maps are 320x320 pixels of 8 bits; they hold the ids of the model's classes, which are
     Cityscapes ids for the thesis's network. Images of any size are stretched to the model's input,
-    as in the appendix. scale: as in `predict`. lens: of the camera; they are made of frames without
-    its distortion, as the odometry sees them.
+    as in the appendix. scale, preprocess: as in `predict`. lens: of the camera; they are made of
+    frames without its distortion, as the odometry sees them.
     A killed run resumes: complete batches are skipped, and of an incomplete batch all images are
     predicted again, because the bits depend on the batch, but only missing files are written. The
     folder is a stage (see provenance): label maps of another model or of other images in it are
@@ -92,12 +101,14 @@ def write_label_maps(
             inputs["scale"] = scale
         if lens is not None and (made_for := lens.record()):
             inputs["camera"] = made_for
+        if preprocess:
+            inputs["preprocess"] = preprocess
         provenance.stage(folder, **inputs)
         pairs = [(path, folder / name) for path, name in zip(paths, names)]
         batches = [pairs[start : start + batch_size] for start in range(0, len(pairs), batch_size)]
         batches = [batch for batch in batches if not all(path.is_file() for _, path in batch)]
         missing = sum(map(len, batches))
-        run = _compiled(model, scale)
+        run = _compiled(model, scale, preprocess)
         height, width, channels = model.input_shape[1:]
         white = white_level(paths[0]) if batches else 0
         bar = files.progress(None, "label maps", len(paths), initial=len(paths) - missing)
@@ -121,19 +132,29 @@ def _write(pair: tuple[Path, Path], label_map: np.ndarray) -> None:
 
 
 @lru_cache(maxsize=4)
-def _compiled(model: Any, scale: float) -> Callable[[np.ndarray], np.ndarray]:
+def _compiled(
+    model: Any, scale: float, preprocess: str | None
+) -> Callable[[np.ndarray], np.ndarray]:
     """Return a function from uint8 images to uint8 label maps.
 
-    It gives the bits of `model.predict` and argmax.
+    It gives the bits of `model.predict` and argmax. Raises InputError if `preprocess` wants colours
+    and the network has none.
     For small networks `model.predict` takes two to four times as long, because every call has a
     set-up and returns 35 probabilities a pixel.
     """
     program.keep_freed_memory()
+    if preprocess in ("torch", "caffe") and model.input_shape[3] == 1:
+        raise InputError(
+            f"preprocess {preprocess}: is for colours, but the network reads gray images; tf is for both"
+        )
     signature = tf.TensorSpec((None, *model.input_shape[1:]), tf.uint8)
 
     @tf.function(input_signature=[signature])
     def call(images: tf.Tensor) -> tf.Tensor:
-        probabilities = model(tf.cast(images, tf.float32) * scale, training=False)
+        values = tf.cast(images, tf.float32) * scale
+        if preprocess:
+            values = preprocess_input(values, "channels_last", preprocess)
+        probabilities = model(values, training=False)
         return tf.cast(tf.argmax(probabilities, axis=-1, output_type=tf.int32), tf.uint8)
 
     def run(images: np.ndarray) -> np.ndarray:

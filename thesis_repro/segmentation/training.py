@@ -4,6 +4,7 @@ A stopped training resumes from a checkpoint.
 """
 
 import json
+import re
 import zlib
 from collections.abc import Callable, Collection, Iterator
 from hashlib import sha256
@@ -21,7 +22,7 @@ from thesis_repro.data.cityscapes import CLASS_WEIGHTS, N_CLASSES
 from thesis_repro.errors import InputError
 from thesis_repro.running import files, program, provenance
 from thesis_repro.running.code_used import digest_of_code
-from thesis_repro.segmentation import augmentation
+from thesis_repro.segmentation import augmentation, keras_2
 from thesis_repro.segmentation.exact import same_bits
 
 # files of a training: the network with the lowest validation loss, and what a training resumes from
@@ -306,15 +307,12 @@ def load_model(path: str | Path) -> Any:
     if not Path(path).is_file():
         raise InputError(f"{path}: no such model; train one or name another file")
     try:
-        model = keras.models.load_model(
-            path, {"Conv2DTranspose": _Conv2DTranspose}, compile=False, safe_mode=True
-        )
+        with keras_2.readable(path) as as_today:
+            model = keras.models.load_model(as_today, compile=False, safe_mode=True)
+    except InputError:
+        raise
     except Exception as error:  # Keras, h5py and zipfile raise many kinds
-        reason = str(error).strip().partition("\n")[0][:200] or type(error).__name__
-        raise InputError(
-            f"{path}: not a Keras model, truncated, or holds code ({reason}); build it from Keras' own "
-            "layers, or copy it again"
-        ) from None
+        raise InputError(f"{path}: {_refusal(error)}") from None
     shapes: Any = [getattr(model, name, ()) for name in ("input_shape", "output_shape")]
     inputs, outputs = shapes
     is_fixed = len(inputs) == 4 and None not in inputs[1:] and inputs[3] in (1, 3)
@@ -331,10 +329,14 @@ def load_model(path: str | Path) -> Any:
     return same_bits(model)
 
 
-class _Conv2DTranspose(keras.layers.Conv2DTranspose):
-    """Keras' layer from files of Keras 2, which name a setting that the layer no longer has."""
-
-    @classmethod
-    def from_config(cls, config: dict[str, Any]) -> keras.layers.Layer:
-        config.pop("groups", None)
-        return keras.layers.Conv2DTranspose.from_config(config)
+def _refusal(error: Exception) -> str:
+    """Return why Keras reads no network, in its words, and what to do."""
+    lines = str(error).strip().splitlines() or [type(error).__name__]
+    cause = next((line for line in lines if line.startswith("Exception encountered: ")), lines[0])
+    cause = cause.removeprefix("Exception encountered: ")[:200]
+    if layer := re.match(r"Error when deserializing class '(\w+)'", lines[0]):
+        return f"Keras 3 does not read its layer {layer[1]} ({cause}); {keras_2.REBUILD}"
+    return (
+        f"not a Keras model, truncated, or holds code ({cause}); build it from Keras' own layers, or "
+        "copy it again"
+    )
