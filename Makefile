@@ -77,7 +77,8 @@ page: setup
 	@$(BIN)/python -m thesis.gallery
 
 # Which notebook needs what; `thesis.figures` runs this with the folder of the run. A notebook is executed again if one that
-# it needs was, or if the digests of the data or of its code have changed (thesis/checked.py, thesis/used.py). With real
+# it needs was, or if the digests of the data or of its code have changed (thesis/checked.py, thesis/used.py). `done` has the
+# contents that each was made from; by these, used.py sets the dates that are compared here. With real
 # frames and no Cityscapes, the shipped model makes the label maps, so nothing is rendered or trained.
 NAMES := 01_load_images_and_labels 02_augmentation 03_unet 04_training 05_prediction 06_keypoint_masks 07_visual_odometry \
          08_results 09_audit
@@ -99,7 +100,7 @@ $(RUN)/notebooks/%.ipynb: $(RUN)/code/% $(RUN)/checked
 	$(BIN)/python -m nbconvert --to notebook --execute --ExecutePreprocessor.kernel_name=python3 \
 	  --ExecutePreprocessor.timeout=-1 --ExecutePreprocessor.shutdown_kernel=immediate \
 	  --output-dir $(@D) --output .$* notebooks/$*.ipynb >$(@:.ipynb=.log) 2>&1 & wait $$! \
-	&& mv $(@D)/.$*.ipynb $@ && echo "$*: done in $$SECONDS s" \
+	&& mv $(@D)/.$*.ipynb $@ && (cd $(RUN) && cksum $(^:$(RUN)/%=%) >done/.$* && mv done/.$* done/$*) && echo "$*: done in $$SECONDS s" \
 	|| { echo "$* failed: $$($(call reason,$(@:.ipynb=.log))) ($(@:.ipynb=.log))" >&2; exit 1; }
 # The last line of a log is the error, but not if the kernel died: then it is what the kernel said, or else memory ran out.
 reason = tr -d '\033' <$(1) | sed 's/\[[0-9;]*m//g' | awk '/^F[0-9]|^Fatal Python error|what\(\):/ && !said {said = $$0} NF {last = $$0} \

@@ -1,7 +1,10 @@
 """Which code each notebook uses: its contents, not its times, decide what is executed again."""
 
 import json
+import os
 import re
+import subprocess
+import time
 from pathlib import Path
 
 from thesis.settings import ROOT
@@ -27,7 +30,8 @@ def code_of(notebook: Path) -> str:
 def record(folder: Path) -> None:
     """Write for each notebook a file with digests of it and of what it uses, if they have changed.
 
-    folder: of the run. The Makefile executes a notebook again if this file is new.
+    folder: of the run. Then the files get dates by which make executes again what was made from
+    other contents: a clock may have been wrong.
     """
     for notebook in (ROOT / "notebooks").glob("*.ipynb"):
         digests = [digest_of_file(notebook)]
@@ -43,3 +47,23 @@ def record(folder: Path) -> None:
         path, text = folder / "code" / notebook.stem, "\n".join(digests)
         if not path.is_file() or path.read_text(encoding="utf-8") != text:
             write_text(path, text)
+    (folder / "done").mkdir(exist_ok=True)
+    now = time.time()
+    results = sorted((folder / "notebooks").glob("*.ipynb"))
+    for path in (folder / "checked", folder / "drives", *(folder / "code").iterdir()):
+        if path.exists():
+            os.utime(path, (now, now))
+    for path in results:
+        date = now if _is_of_these_contents(folder, path.stem) else 0
+        os.utime(path, (date, date))
+
+
+def _is_of_these_contents(folder: Path, name: str) -> bool:
+    """Return whether a notebook was made from what the folder of the run holds now."""
+    done = folder / "done" / name
+    if not done.is_file():
+        return False
+    recorded = done.read_text(encoding="utf-8")
+    names = [line.split()[-1] for line in recorded.splitlines()]
+    today = subprocess.run(["cksum", *names], cwd=folder, capture_output=True, text=True).stdout
+    return bool(names) and today == recorded

@@ -1,8 +1,10 @@
 """Which notebooks are executed again: contents decide, not times."""
 
 import os
+import re
 import shutil
 import sys
+import time
 
 import pytest
 from cells import NOTEBOOKS, executed_by
@@ -14,11 +16,21 @@ def project(tmp_path_factory):
     """A copy of the code with `run`, in which every notebook was executed."""
     root = tmp_path_factory.mktemp("project")
     copy_project([*PACKAGES, "notebooks", "Makefile"], root)
-    (root / "run/notebooks").mkdir(parents=True)
-    record(root, root / "run")
-    for name in ("checked", "drives", *(f"notebooks/{name}" for name in NOTEBOOKS)):
-        (root / "run" / name).touch()
+    run = root / "run"
+    (run / "notebooks").mkdir(parents=True)
+    (run / "checked").touch()
+    record(root, run)
+    recipes = plan(root, run)
+    for name in ("drives", *(f"notebooks/{name}" for name in NOTEBOOKS)):
+        (run / name).touch()
+    for command, name in re.findall(r"&& (cksum [^>]*) >done/\.(\w+)", recipes):
+        (run / "done" / name).write_text(succeed(command.split(), run).stdout)
     return root
+
+
+def plan(root, run):
+    """What make would do, as text."""
+    return succeed(["make", "-n", "notebooks", f"RUN={run}"], root).stdout
 
 
 def record(root, run):
@@ -55,7 +67,38 @@ def test_what_uses_other_contents_is_executed_again(project, tmp_path, changes, 
         path.write_text(before[path].replace(old, new))
         os.utime(path, (0, 0))
     record(project, run)
-    planned = succeed(["make", "-n", "notebooks", f"RUN={run}"], project).stdout
+    planned = plan(project, run)
     for path, text in before.items():
         path.write_text(text)
     assert executed_by(planned) == again.split()
+
+
+HOURS = 3600
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ahead", [-2 * HOURS, 0, 2 * HOURS])
+def test_a_clock_that_was_wrong_changes_nothing(project, tmp_path, ahead):
+    """Results and records get other dates; then 04 was made again, and 09 was changed."""
+    run = shutil.copytree(project / "run", tmp_path / "run")
+
+    def planned():
+        for number, path in enumerate(sorted(run.rglob("*"))):
+            date = time.time() + ahead + number % 7
+            os.utime(path, (date, date))
+        record(project, run)
+        return executed_by(plan(project, run))
+
+    assert planned() == []
+    (run / "notebooks/04_training.ipynb").write_text("another training")
+    assert planned() == ["05", "06", "07", "08", "09"]
+    (run / "notebooks/04_training.ipynb").write_text("")
+    assert planned() == []
+    notebook = project / "notebooks/09_audit.ipynb"
+    before = notebook.read_text()
+    notebook.write_text(before.replace("import", " import"))
+    plans = [planned(), planned()]
+    notebook.write_text(before)
+    assert plans == [["09"], ["09"]] and planned() == []
+    (run / "done/02_augmentation").unlink()  # of an earlier version
+    assert planned() == ["02", "04", "05", "06", "07", "08", "09"]
