@@ -6,6 +6,7 @@ from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
+from traceback import walk_tb
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -123,8 +124,9 @@ def own_calls(path: Path) -> odometry.Calls:
     except OSError:
         raise
     except Exception as error:  # of code that a person wrote
-        raise InputError(f"{path}: {cause(error)}") from error
-    own = {name: defined[name] for name in odometry.Calls._fields if name in defined}
+        raise InputError(_failed(path, error)) from error
+    names = odometry.Calls._fields
+    own = {name: _telling(path, defined[name]) for name in names if name in defined}
     if not own:
         raise InputError(f"{path}: must define a function {' or '.join(odometry.Calls._fields)}")
     if "detect" in own:
@@ -132,6 +134,30 @@ def own_calls(path: Path) -> odometry.Calls:
     if "track" in own:
         own["track"] = _checked_track(path, own["track"])
     return odometry.OPENCV._replace(**own)
+
+
+def _telling(path: Path, function: Callable) -> Callable:
+    """Return a function of a person whose errors name its file and line."""
+
+    def called(*arguments: Any, **named: Any) -> Any:
+        try:
+            return function(*arguments, **named)
+        except (InputError, OSError):
+            raise
+        except Exception as error:
+            raise InputError(_failed(path, error)) from error
+
+    return called
+
+
+def _failed(path: Path, error: Exception) -> str:
+    """Return why a person's file failed, with its last line that was executed."""
+    lines = [
+        number
+        for frame, number in walk_tb(error.__traceback__)
+        if frame.f_code.co_filename == str(path)
+    ]
+    return f"{path}{f', line {lines[-1]}' if lines else ''}: {cause(error)}"
 
 
 def _checked_detect(path: Path, detect: Callable) -> Callable:

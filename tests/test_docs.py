@@ -181,6 +181,26 @@ def test_the_recipes_for_what_people_bring_run(examples, tmp_path):
     assert first.ndim == 2 and first.dtype == np.uint8
 
 
+def test_points_that_leave_the_frame_are_not_found_by_the_recipe_for_own_matches(examples):
+    images, (*_, own, _) = examples
+    frames = [image[..., 0] for image in images[:2]]
+    height, width = frames[0].shape
+    ends = [[-3, 9], [width, 9], [9, -3], [9, height], [0, 0], [width - 1, height - 1]]
+    tracked, was_found = own["track"](*frames, np.float32(ends), None)
+    assert tracked.shape == (6, 2) and was_found.tolist() == [False] * 4 + [True] * 2
+
+
+@pytest.mark.real
+@pytest.mark.slow
+@pytest.mark.parametrize("sequence", ["00", "05"])
+def test_the_recipe_for_own_matches_runs_on_a_whole_street(sequence, kitti_real):
+    (recipe,) = (text for text in blocks(ROOT / "docs/own-masks.md", "python") if "DIS" in text)
+    names = {}
+    exec(recipe.replace('"world/kitti", 0', f"{str(kitti_real)!r}, {sequence!r}"), names)
+    poses = names["result"].poses
+    assert np.isfinite(poses).all() and len(poses) == len(tr.Sequence(kitti_real, sequence))
+
+
 def test_the_changelog_has_one_release_and_short_items():
     text = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
     (release,) = re.findall(r"^## .*", text, re.MULTILINE)

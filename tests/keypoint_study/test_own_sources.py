@@ -174,7 +174,7 @@ def test_what_is_no_python_file_is_one_line(street, capsys, name, content, said)
     code, out = study(street, "--keypoints", path)
     *_, line = capsys.readouterr().err.splitlines()
     assert code == 1 and not out.exists() and line.startswith("error: ")
-    assert f"{name}: " in line and said in line
+    assert re.search(rf"{name}(, line 1)?: ", line) and said in line
 
 
 def test_own_keypoints_have_controls_of_equal_number_and_their_flags_are_told(street, capsys):
@@ -239,10 +239,18 @@ def test_a_source_that_breaks_later_is_told_once_and_stays_in_the_summary(street
     lines = capsys.readouterr().err.splitlines()
     (line,) = [line for line in lines if "broken" in line]
     assert code == 1 and ",," not in line and "\\n" not in line
-    assert "failed: ValueError: broken: x x" in line
+    assert "own.py, line 7: ValueError: broken: x x" in line
     table = pd.read_csv(out / "ratios.csv")
     masked = table[table["method"] == "masked"]
     assert "own" not in set(table["source"])
     assert set(masked["verdict"]) == {"too few sequences to tell"}
     page = (out / "index.html").read_text()
-    assert page.count("failed: ValueError") == 1 and "own: all runs failed" in page
+    assert page.count("own.py, line 7: ValueError") == 1 and "own: all runs failed" in page
+
+
+@pytest.mark.parametrize("name", ["detect", "track", "find_essential_matrix"])
+def test_an_error_in_own_code_is_told_with_its_line(tmp_path, street, name):
+    path = tmp_path / "own.py"
+    path.write_text(f"def {name}(*arguments, **named):\n    empty = []\n    return empty[3]\n")
+    with pytest.raises(InputError, match=r"own\.py, line 3: IndexError"):
+        Source(path, "keypoints").run(Sequence(street, "00").subset(4), odometry.THESIS)

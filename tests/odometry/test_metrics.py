@@ -1,5 +1,7 @@
 """Trajectory errors, compared with values worked out by hand."""
 
+import re
+
 import numpy as np
 import pytest
 from made_up import winding
@@ -180,3 +182,11 @@ def test_poses_without_rotations_are_told():
     straight = np.tile(np.eye(4), (60, 1, 1))
     straight[:, 2, 3] = np.arange(60)
     assert metrics.foreign_poses(straight, straight) == ""  # a camera that does not turn
+
+
+@pytest.mark.parametrize("shape", [(5, 3), (5, 3, 4), (5, 16)])
+def test_paths_of_other_shapes_are_named(shape):
+    for pair in ((np.zeros(shape), ahead(5)), (ahead(5), np.zeros(shape))):
+        for error in (metrics.ate, metrics.rmse, metrics.errors):
+            with pytest.raises(InputError, match=re.escape(f"{shape}")):
+                error(*pair)

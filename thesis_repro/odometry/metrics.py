@@ -44,9 +44,14 @@ def _differences(estimated: np.ndarray, true: np.ndarray) -> np.ndarray:
 
 
 def _as_paths(estimated: np.ndarray, true: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Both paths as arrays. Raises InputError if their lengths differ or are below two."""
+    """Both paths as arrays. Raises InputError for other shapes, other lengths and below two."""
     estimated, true = np.asarray(estimated), np.asarray(true)
-    if estimated.shape != true.shape:
+    if not estimated.shape[1:] == true.shape[1:] == (4, 4):
+        raise InputError(
+            f"the estimated path has the shape {estimated.shape} and the true path {true.shape}; both are "
+            "poses, (n, 4, 4)"
+        )
+    if len(estimated) != len(true):
         raise InputError(
             f"the estimated path has {len(estimated)} poses and the true path {len(true)}; "
             "both need one pose a frame"
