@@ -3,7 +3,6 @@ SHELL := /bin/bash
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
 MAKEFLAGS += --no-print-directory
-PYTHON ?= python3
 BIN := .venv/bin
 # A setting on the command line, or in the environment, reaches Python as a THESIS_REPRO_ variable. Python names a misspelled
 # one of the command line; of the environment, only these are taken.
@@ -23,6 +22,11 @@ export PYTHONWARNINGS := ignore
 export JUPYTER_NO_CONFIG := 1
 export JUPYTER_PREFER_ENV_PATH := 1
 export PYDEVD_DISABLE_FILE_VALIDATION := 1
+# OpenMP allows a list, 4,2, for nested levels; Numba and numexpr read one number
+comma := ,
+ifneq ($(findstring $(comma),$(OMP_NUM_THREADS)),)
+export OMP_NUM_THREADS := $(firstword $(subst $(comma), ,$(OMP_NUM_THREADS)))
+endif
 unexport PYTHONHOME PYTHONDONTWRITEBYTECODE PYTHONSTARTUP JUPYTER_PATH CDPATH TF_USE_LEGACY_KERAS XLA_FLAGS TF_XLA_FLAGS
 
 .PHONY: help setup figures book notebooks page excerpts evidence timings pictures camvid trainings test torture lint lab bench weights pins clean check-data
@@ -57,8 +61,8 @@ setup: .venv/ready $(if $(filter 1,$(GPU)),.venv/ready-gpu)
 	@$(BIN)/thesis-repro --version >/dev/null && $(BIN)/python tools/installed.py || { \
 	  echo "error: .venv no longer works: was it moved or copied, or Python upgraded? Run make clean, then make setup" >&2; exit 1; }
 .venv/ready: environment.txt pyproject.toml
-	@$(PYTHON) tools/can_install.py
-	@echo "installing the pinned packages into .venv (2.4 GB)" && $(PYTHON) -m venv .venv
+	@python=$$($(or $(PYTHON),$$(command -v python3 python3.13 python3.12 python3.11 | head -n 1)) tools/can_install.py \
+	  $(if $(PYTHON),,--search)) && echo "installing the pinned packages into .venv (2.4 GB)" && "$$python" -m venv .venv
 	@$(PIP) $$(grep -o '^uv==[0-9.]*' environment.txt)
 	@$(call install,-r environment.txt)
 	@$(call install,--no-build-isolation -e .)

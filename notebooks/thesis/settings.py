@@ -22,6 +22,8 @@ from thesis_repro.running.values import list_of_widths, number_of_frames, positi
 
 # the checkout, also for a copy of this folder, as `make lab` makes
 ROOT = Path(street_world.__file__).resolve().parents[1]
+if not (ROOT / "Makefile").is_file():  # packages that pip installed have no figures, and no folder
+    raise InputError(f"{ROOT}: is no checkout, which the notebooks need; clone it, run make setup")
 PREFIX = "THESIS_REPRO_"
 
 

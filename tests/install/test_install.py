@@ -206,6 +206,34 @@ def test_what_cannot_be_installed_is_said_with_its_cure(version, system, machine
     assert cure in line and bool(line) == bool(cure) and "\n" not in line
 
 
+def as_310(search, path, monkeypatch):
+    """Look for a Python as Python 3.10 on Linux would, with a PATH and no package index."""
+    monkeypatch.setattr(can_install.sys, "version_info", (3, 10, 13))
+    monkeypatch.setattr(can_install.platform, "system", lambda: "Linux")
+    monkeypatch.setenv("PATH", os.pathsep.join(map(str, path)))
+    monkeypatch.setenv("PIP_NO_INDEX", "1")
+    can_install.main(search)
+
+
+def test_another_python_on_the_path_is_taken_if_python3_does_not_fit(tmp_path, monkeypatch, capsys):
+    for name in ("shims", "real"):
+        (tmp_path / name).mkdir()
+    shim = tmp_path / "shims/python3.13"  # of a version that is not installed
+    shim.write_text("#!/bin/sh\nexit 127\n")
+    shim.chmod(0o755)
+    folders = tmp_path / "shims", tmp_path / "real"
+    with pytest.raises(SystemExit, match="PYTHON=python3.12"):
+        as_310(True, folders, monkeypatch)
+    (tmp_path / "real/python3.11").symlink_to(Path(sys.executable).resolve())
+    with pytest.raises(SystemExit, match="PYTHON=python3.12"):
+        as_310(False, folders, monkeypatch)
+    capsys.readouterr()
+    as_310(True, folders, monkeypatch)
+    out, err = capsys.readouterr()
+    assert out == f"{tmp_path}/real/python3.11\n"
+    assert err.count("\n") == 1 and "3.10" in err and out.strip() in err
+
+
 def test_nothing_is_installed_if_the_python_does_not_fit(checkout, tmp_path):
     (checkout / ".venv").unlink()
     python = tmp_path / "python3.10"  # says so in place of tools/can_install.py

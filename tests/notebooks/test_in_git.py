@@ -9,6 +9,7 @@ from collections import Counter
 import nbformat
 import pytest
 from cells import NOTEBOOKS, cells, code_of, named
+from nbconvert import PythonExporter, ScriptExporter
 
 from thesis.settings import ROOT
 
@@ -126,3 +127,10 @@ def test_what_the_copy_of_the_thesis_lacks_is_in_the_notebook_that_the_table_nam
     rows = re.findall(r"^\|[^|]*\| (\d\d) \| `([^|]*)` \|", table, re.MULTILINE)
     assert len(rows) == 7
     assert [row for row in rows if row[1] not in code_of(named(row[0]))] == []
+
+
+@pytest.mark.parametrize("name", NOTEBOOKS)
+def test_nbconvert_writes_python(name):
+    text, about = PythonExporter().from_filename(ROOT / "notebooks" / name)
+    assert ScriptExporter().from_filename(ROOT / "notebooks" / name)[0] == text
+    assert about["output_extension"] == ".py"

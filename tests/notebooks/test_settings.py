@@ -1,7 +1,7 @@
 import sys
 
 import pytest
-from trials import copy_project, succeed
+from trials import PACKAGES, copy_project, run, snapshot, succeed
 
 from thesis.settings import PROFILES, ROOT, read_settings
 from thesis_repro.errors import InputError
@@ -72,3 +72,13 @@ def test_a_copy_for_the_lab_uses_the_results_of_the_checkout(tmp_path):
     run = succeed([sys.executable, "-c", code], tmp_path / "notebooks", PYTHONPATH=ROOT)
     used, build = run.stdout.split()
     assert used.startswith(str(tmp_path)) and build == str(ROOT / "build/embedded-demo")
+
+
+def test_notebooks_beside_an_installed_package_say_that_they_need_a_checkout(tmp_path):
+    copy_project([*PACKAGES, "notebooks"], tmp_path)  # without what only a checkout has
+    path = f"{tmp_path}:{tmp_path}/notebooks"
+    before = snapshot(tmp_path)
+    failed = run([sys.executable, "-c", "import thesis.settings"], tmp_path, PYTHONPATH=path)
+    assert failed.returncode == 1 and "InputError" in failed.stderr.splitlines()[-1]
+    assert "checkout" in failed.stderr.splitlines()[-1]
+    assert {name for name in snapshot(tmp_path) if "__pycache__" not in name.parts} == set(before)

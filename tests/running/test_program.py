@@ -1,6 +1,7 @@
 """Logs, errors in one line, and signals that stop a program."""
 
 import errno
+import os
 import platform
 import signal
 import subprocess
@@ -9,7 +10,7 @@ import sys
 import pytest
 
 from thesis_repro.errors import InputError
-from thesis_repro.running import files, program
+from thesis_repro.running import files, program, workers
 
 
 def failing(error):
@@ -109,3 +110,25 @@ def test_freed_memory_of_an_image_is_kept_for_the_next():
         for call in ("", "program.keep_freed_memory()")
     ]
     assert pages[1] < pages[0] / 10
+
+
+@pytest.mark.parametrize(
+    "given, left", [("4,2", "4"), ("2", "2"), ("4,", "4"), ("", None), ("all", None)]
+)
+def test_levels_of_threads_become_one_number(given, left, monkeypatch):
+    """OpenMP reads a list, Numba one number."""
+    monkeypatch.setenv("OMP_NUM_THREADS", given)
+    seen = []
+    assert program.run(lambda: seen.append(os.environ.get("OMP_NUM_THREADS"))) == 0
+    assert seen == [left]
+
+
+def test_a_system_without_semaphores_gets_one_process_and_one_line(monkeypatch, caplog):
+    def refuse(*arguments, **named):
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    monkeypatch.setattr(workers, "ProcessPoolExecutor", refuse)
+    with workers.open_pool(2) as pool:
+        assert pool.size == 1 and list(pool.run(pow, [(2, 3)])) == [8]
+    (line,) = caplog.messages
+    assert "/dev/shm" in line and "--jobs 1" in line

@@ -2,7 +2,9 @@
 
 import fcntl
 import os
+from importlib import metadata
 
+import numpy as np
 import pytest
 
 from thesis_repro.errors import InputError
@@ -107,3 +109,13 @@ def test_digests_change_with_the_bytes_and_the_names(tmp_path):
     second = provenance.digest_of_files(paths)
     paths[1] = paths[1].rename(tmp_path / "c")
     assert len({first, second, provenance.digest_of_files(paths)}) == 3
+
+
+def test_a_package_that_another_distribution_brings_has_a_version(monkeypatch):
+    """As tensorflow-cpu brings tensorflow."""
+
+    def none(name):
+        raise metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(provenance.metadata, "version", none)
+    assert provenance.versions("numpy")["versions"]["numpy"] == np.__version__

@@ -63,6 +63,9 @@ def run(main: Callable[[], object]) -> int:
     Ctrl-C, 143 after SIGTERM. Programs print messages.
     """
     print_messages()
+    threads = os.environ.pop("OMP_NUM_THREADS", "").partition(",")[0].strip()
+    if threads.isdigit():  # OpenMP allows a list, for nested levels; Numba reads one number
+        os.environ["OMP_NUM_THREADS"] = threads
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         if signal.getsignal(number) != signal.SIG_IGN:  # as nohup has set SIGHUP
             signal.signal(number, _stop)

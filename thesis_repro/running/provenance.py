@@ -10,6 +10,7 @@ import json
 import os
 import platform
 import re
+import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from importlib import metadata
@@ -151,8 +152,16 @@ def versions(*packages: str) -> dict[str, Any]:
     "opencv" is any of its four. The machine is "x86_64" or "arm64", say: OpenCV and TensorFlow
     round differently on other architectures.
     """
-    found = {name: metadata.version(name) for name in packages if name != "opencv"}
+    found = {name: _version(name) for name in packages if name != "opencv"}
     return {"versions": {"opencv": cv2.__version__, **found}, "machine": platform.machine()}
+
+
+def _version(name: str) -> str:
+    """Return the version of a package, also of one that another distribution brings."""
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:  # such as tensorflow-cpu
+        return sys.modules[name].__version__
 
 
 def digest_of_files(paths: Iterable[str | Path]) -> str:

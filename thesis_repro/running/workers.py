@@ -68,6 +68,18 @@ def _closed(client: Any) -> Iterator[None]:
             client.close()
 
 
+def _processes(number: int) -> ProcessPoolExecutor | None:
+    """Start processes of this machine; None, with a warning, if the system has no semaphores."""
+    try:
+        with program.unstopped():  # not joblib's shared executor, which callers may use, too
+            return ProcessPoolExecutor(number, initializer=_begin, env=ONE_THREAD)
+    except OSError as error:  # they lie in /dev/shm, which a container may lack
+        program.log.warning(
+            f"/dev/shm: {error.strerror}, so one process does all; --jobs 1 asks for one"
+        )
+        return None
+
+
 @contextmanager
 def open_pool(processes: int, scheduler: str | None = None) -> Iterator[Pool]:
     """Open a pool on a Dask scheduler or, without one, on processes of this machine.
@@ -75,12 +87,11 @@ def open_pool(processes: int, scheduler: str | None = None) -> Iterator[Pool]:
     processes: their number; one is this process. scheduler: its address, "tcp://host:8786".
     Raises InputError if the scheduler does not answer or has no workers, or if a worker is lost.
     """
-    if scheduler is None and processes == 1:
-        yield Pool(1)
-        return
+    executor = _processes(processes) if scheduler is None and processes > 1 else None
     if scheduler is None:
-        with program.unstopped():  # not joblib's shared executor, which callers may use, too
-            executor = ProcessPoolExecutor(processes, initializer=_begin, env=ONE_THREAD)
+        if executor is None:
+            yield Pool(1)
+            return
         try:
             yield Pool(processes, executor)
         except BrokenExecutor:
