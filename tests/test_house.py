@@ -33,11 +33,6 @@ def test_no_string_names_code():
     assert re.search(UNSAFE, "HOME = 'thesis_repro.masks:dilate'")
 
 
-def test_newcomers_see_few_names():
-    names = [path.name for path in (ROOT / "thesis_repro").iterdir()]
-    assert len([name for name in names if not name.startswith("_")]) <= 12
-
-
 @pytest.mark.slow
 def test_the_thesis_needs_no_comparison(tiny_kitti, tmp_path):
     """Without keypoint_study, the odometry runs; the command that compares is one line."""

@@ -7,6 +7,9 @@ from street import Street
 import thesis_repro as tr
 from thesis_repro.errors import InputError
 
+POSES = np.tile(np.eye(4), (6, 1, 1))
+POSES[:, :3, 3] = np.outer(np.arange(6), [3, 4, 12])
+
 
 @pytest.fixture(scope="module")
 def street():
@@ -34,6 +37,7 @@ def test_arrays_give_the_bits_of_a_sequence(street):
         ({}, [0, 1, 1, 1, 1, 1]),
         ({"scales": range(6)}, [0, 1, 2, 3, 4, 5]),
         ({"speed": 5, "times": [0, 1, 2, 4, 5, 6]}, [0, 5, 5, 10, 5, 5]),
+        ({"poses": POSES}, [0, 13, 13, 13, 13, 13]),
     ],
 )
 def test_steps_have_the_lengths_that_were_given(street, lengths, expected):

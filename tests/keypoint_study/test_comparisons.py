@@ -132,12 +132,14 @@ def test_a_small_loss_everywhere_shows_beside_one_sequence_that_fails():
 @pytest.mark.parametrize("n", [6, 8, 11])
 def test_the_interval_holds_what_the_signed_rank_test_does_not_reject(n):
     values = np.random.default_rng(n).normal(0.3, 1, n)
-    estimate, low, high = ratios.typical_interval(values)
-    assert low < estimate < high
-    for centre, rejected in ((low, -1), (high, 1)):
-        for side in (-1, 1):
-            p = wilcoxon(values - (centre + side * 1e-9), method="exact").pvalue
-            assert (p <= 0.05) == (side == rejected)
+    estimate, *ends = ratios.typical_interval(values)
+    narrow = np.log(ratios.narrow_interval(np.exp(values)))
+    assert ends[0] < narrow[0] < estimate < narrow[1] < ends[1]
+    for (low, high), level in ((ends, 0.05), (narrow, 0.1)):
+        for centre, rejected in ((low, -1), (high, 1)):
+            for side in (-1, 1):
+                p = wilcoxon(values - (centre + side * 1e-9), method="exact").pvalue
+                assert (p <= level) == (side == rejected)
 
 
 def test_failures_are_counted_and_compared_apart():

@@ -48,6 +48,10 @@ def test_canny_misses_boundaries_of_neighbouring_ids_and_exact_finds_them():
     assert np.array_equal(np.unique(np.nonzero(exact)[1]), [47])
     canny = masks.edges(bands("road", "sky"), (64, 96))
     assert set(np.unique(canny)) == {0, 255} and abs(np.nonzero(canny)[1] - 47.5).max() <= 1
+    right = np.zeros((64, 96), np.uint8)
+    right[:, 48:] = 255  # half of the true boundary, which has two sides
+    assert masks.boundaries_found(right, bands("road", "sky")) == 0.5
+    assert np.isnan(masks.boundaries_found(right, bands("road")))
 
 
 @pytest.mark.parametrize("width", [1, 2, 5, 10, 15])
@@ -58,6 +62,8 @@ def test_dilation_gives_a_square_of_that_width(width):
     assert np.ptp(rows) + 1 == np.ptp(columns) + 1 == width and len(rows) == width**2
     # a square of even width is half a pixel off, as in the thesis
     assert abs(rows.mean() - 20) == (0.5 if width % 2 == 0 else 0)
+    symmetric = masks.dilate(image, width, symmetric=True)
+    assert masks.coverage(symmetric) * 41**2 == pytest.approx((width - 1 + width % 2) ** 2)
 
 
 @pytest.mark.parametrize("width", [2, 5, 10])
@@ -218,9 +224,23 @@ def test_frames_and_masks_have_the_bits_recorded_on_x86():
         assert np.array_equal(images["frame of the network"], cv2.resize(frame, (320, 320)))
 
 
+@pytest.mark.parametrize(
+    "label_map",
+    [[[35]], [[-1, 7]], [[7.0]], [7, 7], [[]], [[[7]]]],
+    ids=["above", "below", "float", "one row", "empty", "channels"],
+)
+def test_label_maps_of_another_kind_are_refused(label_map):
+    with pytest.raises(InputError, match="label map"):
+        masks.keypoint_mask(np.array(label_map), (4, 4), 2)
+    assert not masks.keypoint_mask(np.array([[34]]), (4, 4), 2).any()
+    with pytest.raises(InputError, match="dilation width None"):
+        masks.keypoint_mask(np.array([[7]]), (4, 4))
+
+
 def test_wrong_arguments_are_named(labelled):
     sequence, folder = labelled
-    for width in (0, 2.0):
+    folders.LabelMasks(folder, sequence, 128)  # covers the frame, 48x64
+    for width in (0, 2.0, 129):
         with pytest.raises(InputError, match=f"dilation width {width}"):
             folders.LabelMasks(folder, sequence, width)
     sequence.lens = Camera(np.eye(3), np.ones(4))

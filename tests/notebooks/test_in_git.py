@@ -58,29 +58,6 @@ def test_cells_of_lessons_are_short(name):
 
 
 @pytest.mark.parametrize("name", NOTEBOOKS)
-def test_lessons_import_few_names_of_the_package(name):
-    code = re.sub("(?m)^%", "#", code_of(name))
-    imports = [node for node in ast.walk(ast.parse(code)) if hasattr(node, "names")]
-    names = [
-        each.name
-        for node in imports
-        for each in node.names
-        if getattr(node, "module", each.name).startswith("thesis_repro")
-    ]
-    most = {"05": 7, "07": 7, "08": 10, "09": 8}.get(name[:2], 6)
-    assert 1 < len(names) <= most, names
-
-
-@pytest.mark.parametrize("name", NOTEBOOKS)
-def test_knobs_stand_one_a_line_in_one_cell(name):
-    (knobs,) = (
-        text for text in cells(name, "code").values() if text.startswith("# EDIT HERE: knobs")
-    )
-    targets = [node.targets for node in ast.parse(knobs).body]
-    assert all(len(names) == 1 and names[0].id.isupper() for names in targets)
-
-
-@pytest.mark.parametrize("name", NOTEBOOKS)
 def test_notebooks_in_git_are_valid_and_have_no_outputs(name):
     path = ROOT / "notebooks" / name
     nbformat.validate(nbformat.read(path, 4))

@@ -79,6 +79,33 @@ def test_the_fit_meets_exact_points_and_keeps_the_sign_of_the_translation():
         np.testing.assert_allclose(translation, sign * AHEAD, atol=1e-7)
 
 
+def test_points_vote_that_lie_in_front_of_both_cameras_or_behind_both():
+    random = np.random.default_rng(0)
+    matches = Matches(*random.normal(0, 1, (2, 300, 2)), THESIS.threshold)
+    previous, current = (np.c_[side, np.ones(300)] for side in (matches.previous, matches.current))
+    depths = [  # along both rays, to where they are nearest to each other
+        np.linalg.lstsq(np.transpose([turn(1) @ ray, -other]), -AHEAD)[0]
+        for ray, other in zip(current, previous)
+    ]
+    both = [(np.sign(depths) == sign).all(axis=1).sum() for sign in (1, -1)]
+    assert refine.cheirality_votes(turn(1), AHEAD, refine.columns(matches), 0.0) == tuple(both)
+    assert min(both) > 20 and sum(both) < 280
+
+
+def test_deviations_are_those_of_fits_to_noise():
+    fits = []
+    for seed in range(100):
+        noisy = seen(street(), turn(1), AHEAD, noise=THESIS.threshold / np.sqrt(2), seed=seed)
+        fits.append(refine.fit(turn(1), AHEAD, noisy))
+    turns = [Rotation.from_matrix(turn(1).T @ each.rotation).as_rotvec() for each in fits]
+    for name, errors in (
+        ("rotation_std_deg", turns),
+        ("heading_std_deg", [each.translation for each in fits]),
+    ):
+        largest = np.degrees(np.sqrt(np.linalg.eigvalsh(np.cov(np.transpose(errors)))[-1]))
+        assert np.mean([getattr(each, name) for each in fits]) == pytest.approx(largest, rel=0.3)
+
+
 # A step and its prior
 
 

@@ -61,22 +61,6 @@ def test_the_audit_has_the_times_of_the_budget_beside_it(folder):
     assert whole == pytest.approx(masked[stages].sum() / every, rel=2e-3)
 
 
-def test_rows_without_a_measurement_stay_and_words_appear_once():
-    measurements = [
-        audit.measurement("13", "spread", [1, 2, 3]),
-        audit.measurement("13", "spread", 5),
-    ]
-    table = audit.audit_table(measurements, "made up")
-    assert list(dict.fromkeys(table["row"])) == [row["row"] for row in audit.ROWS]
-    lines = table[table["row"] == "13"]
-    assert (
-        lines["value"].tolist() == [2, 5]
-        and lines["n"].tolist() == [3, 1]
-        and set(lines["data"]) == {"made up"}
-    )
-    assert lines["where"].iloc[0] and not lines["where"].iloc[1]
-
-
 def test_ablations_become_ratios_of_their_reference():
     factors = {
         "baseline": 1.0,

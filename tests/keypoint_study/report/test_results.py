@@ -144,16 +144,6 @@ def test_errors_are_means_with_their_spread_and_the_lowest_is_bold():
     assert not single[ELEVEN].map(lambda cell: "±" in cell).any(axis=None)
 
 
-def test_deviations_of_zero_are_left_out():
-    runs = runs_of(ELEVEN[:5], halved)
-    refined = runs["estimator"] == "refined"
-    runs.loc[~refined, "se3"] *= 1 + 0.1 * runs["repetition"]
-    table = comparison.table_of_errors(comparisons.comparisons_of(runs), runs).content
-    has_deviation = table[ELEVEN[:5]].map(lambda cell: "±" in cell).all(axis=1)
-    varied = (table["error"] == "aligned ATE (m)") & (table["estimator"] == "thesis's estimator")
-    assert has_deviation.equals(varied) and varied.any()
-
-
 def widths_in(text):
     """The width of each table in LaTeX, in points, measured in Computer Modern of 8 points."""
     font = FontProperties(fname=f"{matplotlib.get_data_path()}/fonts/ttf/cmr10.ttf")
@@ -267,16 +257,6 @@ def test_what_is_far_off_is_told_without_it():
     runs.loc[(runs["sequence"] == "03") & (runs["method"] == "masked"), "se3"] *= 40
     text = findings.findings_of(runs, comparisons.comparisons_of(runs), "made up", False)
     assert "without 03, aligned ATE is 0.5" in text
-
-
-@pytest.mark.parametrize("estimators", [["thesis"], ["inliers", "thesis"], ["thesis", "refined"]])
-def test_findings_say_if_the_estimator_that_usually_decides_was_not_run(estimators):
-    runs = runs_of(ELEVEN[:6], halved, estimators=estimators)
-    text = findings.findings_of(runs, comparisons.comparisons_of(runs), "made up", False)
-    (first, usual) = (ESTIMATORS[name] for name in (estimators[0], "refined"))
-    judge = usual if "refined" in estimators else first
-    assert f"The {judge} decides." in text
-    assert (f"The {usual}, which usually decides, was not run." in text) == (judge != usual)
 
 
 def drawn_by_cells(runs):
