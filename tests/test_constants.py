@@ -87,7 +87,7 @@ CONSTANTS = {
         "MAX_ROTATION_STD": 0.5,
         "MAX_HEADING_STD": 5.0,
     },
-    verdicts: {"LEVEL": 95, "NARROW_LEVEL": 90, "MIN_SEQUENCES": 6},
+    verdicts: {"LEVEL": 95, "NARROW_LEVEL": 90, "MIN_SEQUENCES": 6, "DISAGREEING": 2},
     ratios: {"MIN_FOR_INTERVAL": 3, "FAR_OFF": 3},
     cityscapes: {"N_CLASSES": 35},
 }

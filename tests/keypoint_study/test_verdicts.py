@@ -22,6 +22,9 @@ ALIKE = [("rotation", 0.81, 1.24), ("direction", 0.9, 1.1)]
         (FAILURES, {"sides": [1]}, "higher"),
         (WORTH, {"sides": [-1] * 4, "narrow": ALIKE}, "less"),
         (WORTH, {"sides": [1] * 4}, "more"),
+        (WORTH, {"sides": [1, 1], "new_disagree": True}, "no clear difference"),
+        (WORTH, {"sides": [-1, -1], "new_disagree": True}, "no clear difference"),
+        (WORTH, {"sides": [0], "narrow": ALIKE, "new_disagree": True}, "as much"),
         (WORTH, {"sides": [0, 1], "narrow": ALIKE}, "as much"),
         (WORTH, {"sides": [0], "narrow": [*ALIKE, ("direction", 0.79, 1)]}, "no clear difference"),
         (FEW_KEYPOINTS, {"narrow": INSIDE}, "as good"),
@@ -75,6 +78,8 @@ def test_an_interval_is_within_its_margin_or_a_thousandth_outside(
         (ratios.far_off, (pd.Series([1, 1, 9.0]),), [2]),
         (ratios.failing_sequences, (pd.Series([1, 1, 0, 1, 0, 0], [0, 0, 1, 1, 2, 2]),), 2),
         (ratios.failing_sequences, (pd.Series([1, 0, 0], [0, 0, 0]),), 0),
+        (verdicts.disagree, (0.1, [-0.1, -0.2, 0.3]), True),
+        (verdicts.disagree, (-0.1, [-0.1, 0.2, 0.0]), False),
     ],
 )
 def test_limits_of_ratios_and_counts(function, arguments, value):
