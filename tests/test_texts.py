@@ -26,8 +26,11 @@ from thesis_repro.odometry import metrics
 def test_texts_in_git_are_those_of_the_tables_and_short(template, words):
     written = write_texts.WRITTEN[template].read_text(encoding="utf-8")
     assert written.splitlines() == write_texts.render(template).splitlines()
-    if len(written.split()) > words:
-        warnings.warn(f"{template}: {len(written.split())} words, over {words}", stacklevel=1)
+    number = len(
+        written.partition("\n")[2].split()
+    )  # the first line says what the text is made from
+    if number > words:
+        warnings.warn(f"{template}: {number} words, over {words}", stacklevel=1)
 
 
 @pytest.fixture

@@ -1,5 +1,9 @@
-"""Which code each notebook uses: its contents, not its times, decide what is executed again."""
+"""Which code each notebook uses: its contents, not its times, decide what is executed again.
 
+An edited sentence executes nothing: it is put into the executed notebook.
+"""
+
+import hashlib
 import json
 import os
 import re
@@ -20,25 +24,32 @@ DATA = {
 TIMED = "08_results", "09_audit"  # show the times in git, see `timing`
 
 
-def code_of(notebook: Path) -> str:
-    """Return a digest of the code that the cells of a notebook use."""
-    cells = json.loads(notebook.read_text(encoding="utf-8"))["cells"]
-    code = "\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
-    return digest_of_code(re.sub("^[%!].*", "", code, flags=re.MULTILINE))
+def cells_of(notebook: Path) -> list[dict]:
+    """Return the cells of a notebook."""
+    return json.loads(notebook.read_text(encoding="utf-8"))["cells"]
+
+
+def is_code(cell: dict) -> bool:
+    """Return whether a cell is executed."""
+    return cell["cell_type"] == "code"
 
 
 def record(folder: Path) -> None:
-    """Write for each notebook a file with digests of it and of what it uses, if they have changed.
+    """Write for each notebook a file with digests of its code and of what this uses, if changed.
 
-    folder: of the run. Then the files get dates by which make executes again what was made from
-    other contents: a clock may have been wrong.
+    folder: of the run. The sentences of a notebook with the same code are put into what it made.
+    Then the files get dates by which make executes again what was made from other contents: a clock
+    may have been wrong.
     """
     for notebook in (ROOT / "notebooks").glob("*.ipynb"):
-        digests = [digest_of_file(notebook)]
         try:
-            digests.append(code_of(notebook))
+            code = {
+                cell["id"]: "".join(cell["source"]) for cell in filter(is_code, cells_of(notebook))
+            }
+            used = digest_of_code(re.sub("(?m)^[%!].*", "", "\n".join(code.values())))
+            digests = [hashlib.sha256(json.dumps(code).encode()).hexdigest(), used]
         except (ValueError, KeyError, SyntaxError):  # is told when the notebook is executed
-            digests.append("damaged")
+            digests = [digest_of_file(notebook), "damaged"]
         if notebook.stem in DATA:
             digests.append(digest_of_file(ROOT / DATA[notebook.stem]))
         if notebook.stem in TIMED:
@@ -47,6 +58,8 @@ def record(folder: Path) -> None:
         path, text = folder / "code" / notebook.stem, "\n".join(digests)
         if not path.is_file() or path.read_text(encoding="utf-8") != text:
             write_text(path, text)
+        elif (folder / "notebooks" / notebook.name).is_file() and "damaged" not in digests:
+            _put_sentences(notebook, folder)
     (folder / "done").mkdir(exist_ok=True)
     now = time.time()
     results = sorted((folder / "notebooks").glob("*.ipynb"))
@@ -58,6 +71,23 @@ def record(folder: Path) -> None:
         os.utime(path, (date, date))
 
 
+def _put_sentences(notebook: Path, folder: Path) -> None:
+    """Give what a notebook made its sentences, and tell the records of what was made from it."""
+    executed = folder / "notebooks" / notebook.name
+    made = json.loads(executed.read_text(encoding="utf-8"))
+    ran = {cell["id"]: cell for cell in made["cells"]}
+    cells = [ran.get(cell["id"], cell) if is_code(cell) else cell for cell in cells_of(notebook)]
+    if cells == made["cells"]:
+        return
+    before = _sums(folder, [f"notebooks/{notebook.name}"])
+    write_text(executed, json.dumps(made | {"cells": cells}, indent=1, ensure_ascii=False) + "\n")
+    after = _sums(folder, [f"notebooks/{notebook.name}"])
+    for done in (folder / "done").glob("[0-9]*"):
+        text = done.read_text(encoding="utf-8")
+        if before in text:
+            write_text(done, text.replace(before, after))
+
+
 def _is_of_these_contents(folder: Path, name: str) -> bool:
     """Return whether a notebook was made from what the folder of the run holds now."""
     done = folder / "done" / name
@@ -65,5 +95,9 @@ def _is_of_these_contents(folder: Path, name: str) -> bool:
         return False
     recorded = done.read_text(encoding="utf-8")
     names = [line.split()[-1] for line in recorded.splitlines()]
-    today = subprocess.run(["cksum", *names], cwd=folder, capture_output=True, text=True).stdout
-    return bool(names) and today == recorded
+    return bool(names) and _sums(folder, names) == recorded
+
+
+def _sums(folder: Path, names: list[str]) -> str:
+    """Return a line of sum, size and name for each file, as the Makefile records them."""
+    return subprocess.run(["cksum", *names], cwd=folder, capture_output=True, text=True).stdout

@@ -103,22 +103,6 @@ def test_a_copied_environment_is_told(tmp_path, monkeypatch, capsys):
     assert str(tmp_path) in line and "make clean" in line and line.count("\n") == 1
 
 
-@pytest.mark.parametrize(
-    "words, meant",
-    [
-        ("study --kiti a --labels b --output c", "--kitti"),
-        ("study --kitti a --label b --output c", "--labels"),
-        ("odometry --kitti a --sequence 00 --spred=20", "--spread"),
-        ("predict --image a --output b", "--images"),
-    ],
-)
-def test_the_option_that_was_meant_is_named(words, meant, capsys):
-    with pytest.raises(SystemExit, match="2"):
-        cli.main(words.split())
-    *_, line = capsys.readouterr().err.splitlines()
-    assert line.endswith(f" {meant}?")
-
-
 def test_a_path_begins_at_home_where_no_shell_replaces_it(monkeypatch):
     monkeypatch.setenv("HOME", "/home/me")
     words = ["study", "--kitti=~/k", "--labels=~/l", "--masks", "n=~/m", "--output=~/o"]

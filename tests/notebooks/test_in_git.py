@@ -3,12 +3,11 @@
 import ast
 import json
 import re
-import statistics
 from collections import Counter
 
 import nbformat
 import pytest
-from cells import NOTEBOOKS, cells, code_of, named
+from cells import NOTEBOOKS, code_of, named
 from nbconvert import PythonExporter, ScriptExporter
 
 from thesis.settings import ROOT
@@ -47,14 +46,6 @@ MIRRORS: dict = {
     ("A.8", "np.argmax"): "05",
 }
 RENAMED = {"RandomBrightness": "RandomBrightnessContrast"}  # by the library
-
-
-@pytest.mark.parametrize("name", NOTEBOOKS)
-def test_cells_of_lessons_are_short(name):
-    lengths = {text: len(text.splitlines()) for text in cells(name, "code").values()}
-    assert statistics.median_low(lengths.values()) <= 5
-    assert [text for text, lines in lengths.items() if lines > 15 and LOOP not in text] == []
-    assert max(lengths.values()) <= 25
 
 
 @pytest.mark.parametrize("name", NOTEBOOKS)
