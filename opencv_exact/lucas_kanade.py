@@ -23,7 +23,7 @@ import numpy as np
 from numba.core.registry import cpu_target
 from numba.extending import is_jitted
 
-from opencv_exact.compiling import compiled
+from opencv_exact.compiling import compiled, is_on_disk
 
 # Numba inlines these before LLVM sees them. Inlined by LLVM, most loops would stay scalar.
 inlined = partial(compiled, inline="always", no_cpython_wrapper=True)
@@ -173,6 +173,11 @@ def reason_for_opencv() -> str:
     if not (same and np.array_equal(own[2][found], errors.ravel()[found])):
         return f"OpenCV {cv2.__version__} adds in another order here"
     return ""
+
+
+def is_ready() -> bool:
+    """Return whether an earlier use has compiled the lanes, or they are not used here."""
+    return is_on_disk(track_points) or not _has_avx2()
 
 
 def _has_avx2() -> bool:

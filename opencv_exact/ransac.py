@@ -23,7 +23,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from opencv_exact import epipolar
+from opencv_exact import epipolar, lucas_kanade
 from opencv_exact.compiling import compiled, inlined, is_on_disk
 from opencv_exact.five_point import SAMPLE_SIZE
 from opencv_exact.real_roots import LANES
@@ -115,8 +115,8 @@ def as_pairs(points: np.ndarray) -> np.ndarray:
 
 
 def is_compiled() -> bool:
-    """Return whether an earlier search has compiled this module, so that it only has to load."""
-    return is_on_disk(_winner)
+    """Return whether an earlier use has compiled search and tracker, so that they only load."""
+    return is_on_disk(_winner) and lucas_kanade.is_ready()
 
 
 def draw_samples(points: int, samples: int) -> np.ndarray:

@@ -30,16 +30,38 @@ from thesis.settings import ROOT
 from thesis_repro import masks, odometry
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.masks import folders
-from thesis_repro.odometry import THESIS, Odometry, loop
+from thesis_repro.odometry import THESIS, Odometry, loop, sharing
 from thesis_repro.odometry.estimators import refined
 from thesis_repro.running import program
 from thesis_repro.running.files import write_text
 from thesis_repro.segmentation import prediction
 
-FRAMES = 40  # from the sequence's start
+FRAMES = 40  # from the sequence's start; longer runs go back and forth over them
+LENGTHS = (100, 1000)  # frames of a run with 2,000 keypoints
+KEYPOINTS = (200, 2000, 5000)  # of a run of LENGTHS[0] frames
+TOGETHER = (1, 16, 64)  # runs in one pass
 REPEATS = 3
 WIDTHS = range(1, 17)  # dilation widths in pixels; with all keypoints, 17 runs
 FIRST_USE = "import thesis_repro.odometry.refined, thesis_repro.odometry.sharing"
+
+FASTER = loop.Calls(
+    track=sharing.track,
+    find_essential_matrix=sharing.find_essential_matrix,
+    recover_pose=sharing.recover_pose,
+)  # those of a long run
+ONE_RUN = """
+import sys, time
+import cv2
+import thesis_repro as tr
+from thesis_repro.odometry.sharing import SharedCalls
+cv2.setNumThreads(1)
+root, name, frames = sys.argv[1:]
+drive = tr.Sequence(root, name)
+tr.run(drive.subset(3), calls=SharedCalls().calls)
+started = time.perf_counter()
+tr.run(drive.subset(int(frames)), calls=SharedCalls().calls)
+print(time.perf_counter() - started)
+"""
 
 
 def seconds(work, clock=time.perf_counter):
@@ -114,6 +136,97 @@ def shared_cost(sequence):
     return *(1e3 * cost / len(sequence) for cost in costs), same
 
 
+def bouncing(sequence, frames):
+    """Return a sequence of so many frames in memory, which goes back and forth over another."""
+    there = range(len(sequence) - 1)
+    order = np.resize([*there, *(len(sequence) - 1 - k for k in there)], frames)
+    pictures = list(sequence)
+    for picture in pictures:
+        picture.setflags(write=False)
+    scales = np.ones(frames)
+    chosen = [pictures[k] for k in order]
+    return Sequence.from_arrays(chosen, sequence.intrinsics, scales=scales)
+
+
+def plain_script(sequence, settings):
+    """Call OpenCV's four functions on every frame, as a short script of one's own does."""
+    points, previous = None, None
+    for frame in sequence:
+        if previous is not None:
+            tracked, followed = loop.track(previous, frame, points, settings)
+            old, new = (
+                loop.normalise(side[followed], sequence.intrinsics) for side in (points, tracked)
+            )
+            matrix, _ = loop.find_essential_matrix(new, old, settings.threshold)
+            loop.recover_pose(matrix[:3], new, old)
+            points = tracked[followed]
+        if points is None or len(points) < settings.redetect_below:
+            points = loop.detect(frame, settings)
+        previous = frame
+
+
+def of_keypoints(number):
+    """Return the thesis's settings with another number of keypoints."""
+    quality = min(THESIS.quality, 20 / number)
+    return replace(THESIS, max_keypoints=number, redetect_below=number, quality=quality)
+
+
+def call_costs(sequence):
+    """Yield (what, milliseconds, reference) of three calls against OpenCV's, the best of 5."""
+    previous, frame = (sequence.frame(k) for k in range(2))
+    for picture in (previous, frame):
+        picture.setflags(write=False)
+    for number in KEYPOINTS:
+        points = loop.detect(previous, of_keypoints(number))
+        tracked, followed = loop.track(previous, frame, points)
+        old, new = (
+            loop.normalise(side[followed], sequence.intrinsics) for side in (points, tracked)
+        )
+        matrix, _ = loop.find_essential_matrix(new, old, THESIS.threshold)
+        arguments = {
+            "track": (previous, frame, points),
+            "find_essential_matrix": (new, old, THESIS.threshold),
+            "recover_pose": (matrix, new, old),
+        }
+        for name, values in arguments.items():
+            least = np.full(2, np.inf)
+            for _ in range(5):
+                for k, calls in enumerate((FASTER, loop.OPENCV)):
+                    work = partial(getattr(calls, name), *values)
+                    least[k] = min(least[k], seconds(work, time.thread_time))
+            yield f"{name}, {len(points)} points", *(1e3 * least)
+
+
+def run_costs(sequence):
+    """Yield (what, milliseconds a frame, reference) of whole runs against the plain script."""
+    cases = [(LENGTHS[0], number) for number in KEYPOINTS]
+    cases += [(frames, THESIS.max_keypoints) for frames in LENGTHS[1:]]
+    for frames, number in cases:
+        drive, settings = bouncing(sequence, frames), of_keypoints(number)
+        costs = [
+            seconds(partial(odometry.run, drive, settings, calls=FASTER), time.process_time),
+            seconds(partial(plain_script, drive, settings), time.process_time),
+        ]
+        yield f"a run, {frames} frames, {number} keypoints", *(1e3 * np.array(costs) / frames)
+    one = None
+    for count in TOGETHER:
+        drive = bouncing(sequence, FRAMES)
+        runs = {seed: (replace(THESIS, shuffle_seed=seed), None) for seed in range(count)}
+        cost = seconds(partial(odometry.run_many, drive, runs), time.process_time)
+        one = one or cost
+        yield f"{count} runs in one pass, a run", *(1e3 * np.array([cost / count, one]) / FRAMES)
+    one, both = (max(wall_of_processes(sequence, count)) for count in (1, 2))
+    yield "a run in each of two processes", *(1e3 * np.array([both, one]) / len(sequence))
+
+
+def wall_of_processes(sequence, count):
+    """Return the seconds of a run in each of so many processes at once, without their starts."""
+    folder, frames = sequence.folder, str(len(sequence))
+    command = [sys.executable, "-c", ONE_RUN, folder.parents[1], folder.name, frames]
+    begun = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(count)]
+    return [float(process.communicate()[0]) for process in begun]
+
+
 def mask_cost(sequence, labels):
     """Return CPU milliseconds a mask, for masks made together and one by one.
 
@@ -183,6 +296,20 @@ def cost_ratios(sequence):
     return table.assign(ratio=table["measured"] / table["reference"])
 
 
+def scale(sequence):
+    """Return a table of calls and runs against OpenCV's, and of more runs against one."""
+    cv2.setNumThreads(1)
+    odometry.run(sequence.subset(3), calls=FASTER)  # loads compiled code
+    rows = [*call_costs(sequence), *run_costs(sequence)]
+    table = pd.DataFrame(rows, columns=["what", "measured", "reference"])
+    table.insert(1, "unit", ["ms" if "points" in what else "ms a frame" for what in table["what"]])
+    against = [
+        "OpenCV's" if "points" in what or "frames" in what else "one" for what in table["what"]
+    ]
+    table.insert(3, "against", against)
+    return table.assign(ratio=table["measured"] / table["reference"])
+
+
 def main():
     """Print the ratios, and write them as JSON."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -190,7 +317,8 @@ def main():
         "--kitti", required=True, type=Path, help="KITTI odometry folder (sequences, poses)"
     )
     options = parser.parse_args()
-    table = cost_ratios(Sequence(options.kitti, "00").subset(FRAMES))
+    drive = Sequence(options.kitti, "00").subset(FRAMES)
+    table = pd.concat([cost_ratios(drive), scale(drive)], ignore_index=True)
     write_text(ROOT / "build" / "bench.json", table.to_json(orient="records", indent=1) + "\n")
     print(f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}, OpenCV {cv2.__version__}")
     print(table.to_string(index=False, float_format="{:.3g}".format))

@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 import trials
 
+import opencv_exact
 import thesis_repro as tr
 from keypoint_study import comparisons, jobs, runner, worth
 from keypoint_study.report import comparison
@@ -19,6 +20,7 @@ from thesis_repro.odometry import OPENCV
 
 RECORD = Path(__file__).with_name("promised.txt")
 RUNS = trials.ROOT / "tests" / "keypoint_study" / "runs.csv"
+EXACT = ("find_essential_matrix", "reason_for_opencv", "recover_pose", "track")
 ADVICE = (
     "if this is meant: change tests/command/promised.txt, tell it in CHANGELOG.md, and look into "
     "docs/promises.md; before a name goes, a version warns"
@@ -58,6 +60,7 @@ def of_python():
     own = {called(name, value) for name, value in OPENCV._asdict().items()}
     return {
         "thesis_repro": {called(name, attrgetter(name)(tr)) for name in names},
+        "opencv_exact": {called(name, getattr(opencv_exact, name)) for name in EXACT},
         "a file of --keypoints": own,
     }
 

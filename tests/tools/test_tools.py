@@ -30,6 +30,17 @@ def test_bench_compares_each_measurement_with_a_reference(small_world, monkeypat
     assert table.to_json(orient="records").count('"ratio"') == 5
 
 
+def test_bench_compares_calls_and_runs_with_opencvs(small_world, monkeypatch):
+    monkeypatch.setattr(bench, "KEYPOINTS", (100,))
+    monkeypatch.setattr(bench, "LENGTHS", (5, 7))
+    monkeypatch.setattr(bench, "TOGETHER", (1, 2))
+    monkeypatch.setattr(bench, "FRAMES", 4)
+    table = bench.scale(Sequence(small_world / "kitti", "00").subset(4))
+    assert len(table) == 3 + 2 + 2 + 1 and (table["ratio"] > 0).all()
+    assert table["ratio"].tolist() == pytest.approx(table["measured"] / table["reference"])
+    assert (table["against"] == "OpenCV's").sum() == 3 + 2
+
+
 @pytest.mark.torture
 def test_the_training_writes_a_model_and_its_card(camvid_real, tmp_path, monkeypatch):
     for name, value in (

@@ -42,11 +42,14 @@ def synthesize(options: Any) -> None:
 
 def check_data(options: Any) -> int:
     """Check folders of KITTI, Cityscapes or KITTI's street scenes for damage."""
+    import opencv_exact  # loads the compiler
     from thesis_repro import checks
 
     roots = options.kitti, options.cityscapes, options.kitti_semantic
     if not any(roots):
         raise InputError("no folder to check: give --kitti, --cityscapes or --kitti-semantic")
+    if opencv_exact.is_compiled() and opencv_exact.reason_for_opencv():
+        print(f"tracker: OpenCV's own, because {opencv_exact.reason_for_opencv()}")
     return int(not checks.report(*roots))
 
 
