@@ -56,6 +56,7 @@ def test_an_interval_is_within_its_margin_or_a_thousandth_outside(
         (1 / margin + 0.001, margin - 0.001, within),
         (1 / margin - 0.001, margin - 0.001, under),
         (1 / margin + 0.001, margin + 0.001, otherwise),
+        (1 / margin + 0.001, margin, otherwise),
     ):
         assert verdict(rule, 6, narrow=[*others, (name, low, high)]) == word
 

@@ -251,6 +251,11 @@ def test_keypoints_that_cannot_be_pixels_are_refused(drive):
         settings = replace(THESIS, detector=lambda *given: change(detect(*given)))  # noqa: B023
         with pytest.raises(InputError, match=f"frame 0: .*{words}"):
             odometry.run(drive, settings)
+    corners = np.float32([[-1, -1], [480, 160]])
+    np.testing.assert_array_equal(inputs.keypoints(corners, drive.frame(0), "detector"), corners)
+    for outside in (corners - np.float32(0.01), corners + np.float32([[0.01, 0]])):
+        with pytest.raises(InputError, match="outside"):
+            inputs.keypoints(outside, drive.frame(0), "detector")
 
 
 @pytest.mark.parametrize("order, warns", [(slice(None), False), (slice(None, None, -1), True)])
@@ -547,6 +552,8 @@ def test_shuffled_points_change_the_path_and_repeat_with_the_seed(drive):
     )
     np.testing.assert_array_equal(first, again)
     assert np.abs(first - other).max() > 1e-6 and np.abs(first - plain).max() > 1e-6
+    orders = [replace(SMALL, shuffle_seed=0).order(frame, 99).tolist() for frame in (1, 2)]
+    assert orders[0] != orders[1] and sorted(orders[0]) == sorted(orders[1]) == [*range(99)]
 
 
 # What the caller does with the arrays does not matter
