@@ -13,7 +13,6 @@ takes eight at a time go into four partial sums, the last ones into a fifth.
 What the lanes work on is one record, so that the compiler sees that its parts do not overlap.
 """
 
-from concurrent.futures import ThreadPoolExecutor
 from functools import cache, partial
 from typing import Any, NamedTuple
 
@@ -46,7 +45,6 @@ SCALE = np.float32(1 / (1 << 20))  # of OpenCV's sums
 EPSILON = np.float32(np.finfo(np.float32).eps)
 BACK_AND_FORTH = 0.01  # pixels; a step that undoes the last one up to this ends the search
 USES_STEPS, USES_EPSILON = cv2.TERM_CRITERIA_COUNT, cv2.TERM_CRITERIA_EPS
-MOST_ALONE = 128  # points that are not worth a thread
 GOES_ON, CONVERGED, OSCILLATES = 0, 1, 2  # news of a lane after a step
 IDLE = -1  # in place of a point, in a lane without one
 NOWHERE = np.float32(-1e9)  # the place of a window whose pixels have not been read
@@ -109,7 +107,7 @@ def track(
     `reason_for_opencv` names a reason. OpenCV does the rest.
 
     Pyramids of the last two frames that nobody can change (`frame.setflags(write=False)`) are kept.
-    As many threads are used as OpenCV may use (cv2.setNumThreads).
+    One thread is used, without Python's lock.
     Raises ValueError for first guesses.
     """
     if nextPts is not None or flags & cv2.OPTFLOW_USE_INITIAL_FLOW:
@@ -137,7 +135,8 @@ def track(
         )
     wants_eigenvalues = bool(flags & cv2.OPTFLOW_LK_GET_MIN_EIGENVALS)
     order = np.argsort(points[:, 1])  # neighbours in turn find their pixels in the cache
-    tracked, status, errors = _in_lanes(
+    tracked, status, errors = track_points(
+        new_block(),
         _kept_pyramid(prevImg, maxLevel),
         _kept_pyramid(nextImg, maxLevel),
         points[order],
@@ -167,7 +166,7 @@ def reason_for_opencv() -> str:
     expected, status, errors = cv2.calcOpticalFlowPyrLK(*frames, points, None)
     criteria = Criteria(30, 0.01 * 0.01, np.float32(1e-4), False)
     first, second = (pyramid(frame, 3) for frame in frames)
-    own = _in_lanes(first, second, points, criteria)
+    own = track_points(new_block(), first, second, points, criteria)
     found = status.ravel() == 1
     same = np.array_equal(own[0], expected) and np.array_equal(own[1], found)
     if not (same and np.array_equal(own[2][found], errors.ravel()[found])):
@@ -202,26 +201,6 @@ def _kept_pyramid(frame: np.ndarray, most_levels: int) -> Pyramid:
     result = pyramid(frame, most_levels)
     _kept = [*kept[-1:], (frame, most_levels, result)]
     return result
-
-
-def _in_lanes(
-    previous: Pyramid, current: Pyramid, points: np.ndarray, criteria: Criteria
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """`track_points`, in as many threads as OpenCV may use."""
-    threads = min(cv2.getNumThreads(), 1 + len(points) // MOST_ALONE)
-    parts = np.array_split(points, max(threads, 1))
-    track_part = partial(_track_part, previous, current, criteria)
-    if len(parts) == 1:
-        return track_part(points)
-    with ThreadPoolExecutor(len(parts)) as pool:
-        tracked, found, errors = zip(*pool.map(track_part, parts))
-    return np.concatenate(tracked), np.concatenate(found), np.concatenate(errors)
-
-
-def _track_part(
-    previous: Pyramid, current: Pyramid, criteria: Criteria, points: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    return track_points(new_block(), previous, current, points, criteria)
 
 
 def pyramid(frame: np.ndarray, most_levels: int) -> Pyramid:

@@ -195,18 +195,6 @@ def test_a_frame_that_changes_is_not_remembered():
         assert differences(buffer, previous, points)[2] == 0
 
 
-def test_threads_change_no_bit():
-    random = np.random.default_rng(6)
-    previous, current = street(random, 2)
-    points = random.uniform((-9, -9), (342, 209), (700, 2))
-    threads = cv2.getNumThreads()
-    try:
-        cv2.setNumThreads(3)
-        assert differences(previous, current, points)[2] == 0
-    finally:
-        cv2.setNumThreads(threads)
-
-
 SAYS_WHY = "from opencv_exact import reason_for_opencv; print(reason_for_opencv())"
 
 
