@@ -30,7 +30,7 @@ LIST = Path(__file__).with_suffix(".txt")
 PROCESSES = 2
 LIMIT = 300  # seconds of a processor for the tests of one change: an endless loop is noticed
 COPIED = ("thesis_repro", "keypoint_study", "opencv_exact", "street_world", "notebooks", "tests")
-COPIED += ("tools", "pyproject.toml")
+COPIED += ("tools", "pyproject.toml", "Makefile")
 FORK = multiprocessing.get_context("fork")
 
 
