@@ -94,7 +94,7 @@ def time_savings(seconds: pd.DataFrame) -> pd.DataFrame:
     for threads, rows in seconds.groupby("threads"):
         baseline = rows.loc[rows["method"] == "baseline", "seconds"].sum()
         of_widths = rows[rows["method"] == "masked"].groupby("dilation_width")["seconds"].sum()
-        name = f"{threads} thread" + "s" * (threads > 1)
+        name = f"{threads} threads" if threads > 1 else "1 thread"
         columns[name] = percent_change(of_widths, baseline)
     return pd.DataFrame(columns)
 

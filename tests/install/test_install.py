@@ -34,7 +34,8 @@ def test_the_lock_has_a_version_of_every_requirement_in_its_range():
 def test_a_release_has_one_version():
     cited = yaml.safe_load((ROOT / "CITATION.cff").read_text())
     changes = re.findall(r"^## (.*)$", (ROOT / "CHANGELOG.md").read_text(), re.M)
-    assert cited["version"] == PROJECT["version"] == changes[0]
+    released = [name for name in changes if name != "Unreleased"]
+    assert cited["version"] == PROJECT["version"] == released[0]
 
 
 def uv(*words):

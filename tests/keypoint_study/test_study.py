@@ -183,7 +183,7 @@ def test_a_killed_study_resumes_and_ends_as_an_undisturbed_one(
 def test_each_folder_of_label_maps_may_name_its_ids(small_world, small_labels, tmp_path):
     numbers = np.full(256, 255, np.uint8)  # train ids, by label id
     numbers[[ID[name] for name in TRAINED]] = range(len(TRAINED))
-    for path in sorted((small_labels / "00").iterdir()):
+    for path in sorted((small_labels / "00").glob("*.png")):
         train_ids = numbers[cv2.imread(str(path), cv2.IMREAD_UNCHANGED)]
         write_png(tmp_path / "train" / "00" / path.name, train_ids)
         label_map = label_ids.read(tmp_path / "train" / "00" / path.name, "train")
