@@ -23,6 +23,7 @@ PARTS = (
     "figures/*.*",
     f"figures/{gallery.REAL}/**/*",
     "tests/reference/*.md",
+    "opencv_exact/*.md",
     "thesis_repro/**/*.md",
     "thesis_repro/**/*.py",
     "keypoint_study/**/*.py",
