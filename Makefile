@@ -8,7 +8,7 @@ BIN := .venv/bin
 # one of the command line; of the environment, only these are taken.
 SETTINGS := KITTI CITYSCAPES KITTI_SEMANTIC PROFILE IMAGE_SIZE BASE_FILTERS BATCH_SIZE EPOCHS FRAMES WIDTHS REPETITIONS JOBS \
             BUILD FIGURES DASK_SCHEDULER
-MINE := PYTHON GPU CAMVID PSEUDO RAW LISTEN RUN
+MINE := PYTHON GPU CAMVID JOB TRAINED PSEUDO RAW LISTEN RUN
 of = $(foreach name,$(2),$(if $(filter $(1),$(origin $(name))),$(name)))
 given := $(filter-out $(MINE) MAKE% -%,$(sort $(call of,command line,$(.VARIABLES))))
 around := $(foreach name,$(call of,environment,$(SETTINGS)),$(if $(THESIS_REPRO_$(name)),,$(name)))
@@ -153,7 +153,7 @@ pictures: setup
 trainings: setup
 	@$(BIN)/python tools/trainings.py
 camvid: setup
-	@THESIS_REPRO_PROFILE=$(or $(THESIS_REPRO_PROFILE),thesis) $(BIN)/python tools/camvid.py "$(CAMVID)"
+	@THESIS_REPRO_PROFILE=$(or $(THESIS_REPRO_PROFILE),thesis) $(BIN)/python tools/camvid.py "$(CAMVID)" "$(JOB)" "$(TRAINED)"
 weights: setup
 	@$(BIN)/python tools/train_shipped.py "$(CAMVID)" "$(KITTI_SEMANTIC)" "$(PSEUDO)" build/shipped
 # Not `setup`, which would install what is not resolved yet.

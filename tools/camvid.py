@@ -3,29 +3,40 @@
 `make camvid CAMVID=/path` takes the thesis's settings: 64 filters, 320x320, its loss, weights and
 augmentation, Adam, batches of 16, at most 100 epochs, a patience of 5. It takes hours, and can be
 stopped and resumed at any moment. EPOCHS=10 ends sooner; a later call with more goes on.
-KITTI_SEMANTIC=/path: also the mean IoU on KITTI's street scenes. KITTI=/path: also its label maps.
+KITTI_SEMANTIC=/path: also the mean IoU on KITTI's street scenes. KITTI=/path: also its label maps,
+and what masks from them do to the odometry.
+JOB=folder only writes what tools/camvid_jax.py needs to train elsewhere, on a GPU; TRAINED=folder
+takes what that program wrote, one training a seed, in place of a training here.
 Cityscapes, which the thesis trained on, cannot be had here. CamVid has images to validate on, so
 none are split off.
 """
 
+import json
 import sys
 import time
+from pathlib import Path
 
 from thesis_repro import segmentation  # noqa: F401  sets what TensorFlow reads at its import
 
 # isort: split
+import cv2
 import keras
 import numpy as np
 import pandas as pd
 import tensorflow as tf
 
-from keypoint_study.report import style
+from keypoint_study import comparisons
+from keypoint_study.jobs import CONTROL_WIDTH
+from keypoint_study.plan import Study
+from keypoint_study.report import comparison, style
+from keypoint_study.report import worths as report_worths
+from keypoint_study.sources import Source
 from thesis import domain_gap, timing
 from thesis.reported import REPORTED
 from thesis.settings import PROFILES, ROOT, folder, read_settings
 from thesis_repro.data import cityscapes, kitti
 from thesis_repro.errors import InputError
-from thesis_repro.running import program, provenance
+from thesis_repro.running import files, program, provenance
 from thesis_repro.segmentation import augmentation, prediction, training
 from thesis_repro.segmentation.unet import build_unet
 
@@ -95,6 +106,43 @@ def train(train_batches, validation, sizes, root, seed):
     return stage, resumable.history
 
 
+def write_job(folder, train_batches, validation, sizes, seed):
+    """Write what tools/camvid_jax.py reads: the network, its settings, the images, augmented."""
+    size = sizes.image_size
+    network = build_unet((size, size, 1), cityscapes.N_CLASSES, sizes.base_filters)
+    for split, batches in (("train", train_batches), ("val", validation)):
+        for kind, images in zip(("images", "labels"), batches.sets[0], strict=True):
+            (folder / f"{split}_{kind}").mkdir(parents=True)
+            for index, image in enumerate(files.progress(images, f"{split} {kind}", unit="image")):
+                path = folder / f"{split}_{kind}" / f"{index:04}.webp"
+                # the quality of no loss
+                cv2.imwrite(f"{path}", image, [cv2.IMWRITE_WEBP_QUALITY, 101])
+    job = {
+        "network": json.loads(network.to_json()),
+        "class_weights": np.asarray(cityscapes.CLASS_WEIGHTS).tolist(),
+        "seed": seed,
+    }
+    numbers = ("batch_size", "learning_rate", "epochs", "patience")
+    job |= {name: getattr(sizes, name) for name in numbers}
+    files.write_text(folder / "job.json", json.dumps(job))
+
+
+def read_trained(folder, sizes):
+    """Return {seed: (network, history)} of what tools/camvid_jax.py wrote, and where it ran."""
+    size = sizes.image_size
+    trained = {}
+    for path in sorted(folder.glob("seed_*.json")):
+        network = build_unet((size, size, 1), cityscapes.N_CLASSES, sizes.base_filters)
+        with np.load(path.with_suffix(".npz")) as weights:
+            network.set_weights([weights[name].astype(np.float32) for name in weights.files])
+        history = pd.DataFrame(json.loads(path.read_text(encoding="utf-8")))
+        history.columns = history.columns.str.replace("f1_score", "f1-score")  # the library's name
+        trained[int(path.stem.removeprefix("seed_"))] = network, history
+    if not trained:
+        raise InputError(f"{folder}: TRAINED has no seed_0.json; tools/camvid_jax.py writes it")
+    return trained, (folder / "machine.txt").read_text(encoding="utf-8").strip()
+
+
 def curves(history):
     """Draw loss, F1 and IoU over the epochs (Figures 4.1 and 4.2)."""
     figure, panels = style.new_figure(1, 3, height=2.6)
@@ -120,29 +168,60 @@ def example(model, images, labels):
     return figure
 
 
-def table_of_training(history, patience, machine):
-    """Return one row a fact: epochs, early stopping, seconds, scores beside the thesis's."""
+def facts_of_training(history, patience):
+    """Return {fact: text} of a training: its epochs, and the scores of its last and best epoch."""
     best, last = history.loc[history["val_loss"].idxmin()], history.iloc[-1]
     stopped = last["epoch"] - best["epoch"] >= patience
-    rows = [
-        ("epochs", f"{len(history)}", "24"),
-        ("ended by early stopping", "yes" if stopped else "no: EPOCHS ended it", "yes"),
-        ("epoch of the lowest validation loss", f"{best['epoch']:.0f}", ""),
-        ("seconds an epoch, median", f"{history['seconds'].median():.0f}, {machine}", ""),
-    ]
-    reported = REPORTED["segmentation_results"]
-    for prefix, part, key in (("", "training", "train"), ("val_", "validation", "validation")):
+    facts = {
+        "epochs": f"{len(history)}",
+        "ended by early stopping": "yes" if stopped else "no: EPOCHS ended it",
+        "epoch of the lowest validation loss": f"{best['epoch']:.0f}",
+        "seconds an epoch, median": f"{history['seconds'].median():.1f}",
+    }
+    for prefix, part in (("", "training"), ("val_", "validation")):
         for name, title in SCORES.items():
             values = [f"{row[f'{prefix}{name}']:.3f}" for row in (last, best)]
-            thesis = str(reported[key][REPORTED_KEYS[name]])
-            rows.append(
-                (f"{title}, {part}, last epoch (best epoch)", "{} ({})".format(*values), thesis)
-            )
-    return pd.DataFrame(rows, columns=["training", "CamVid, here", "Cityscapes, thesis"])
+            facts[f"{title}, {part}, last epoch (best epoch)"] = "{} ({})".format(*values)
+    return facts
 
 
-def main(camvid):
-    """Train, and write what the training gives."""
+def table_of_training(histories, patience):
+    """Return one row a fact, one column a training, and what the thesis reports of Cityscapes."""
+    facts = {
+        f"CamVid, seed {seed}": facts_of_training(history, patience)
+        for seed, history in histories.items()
+    }
+    reported = REPORTED["segmentation_results"]
+    thesis = {"epochs": "24", "ended by early stopping": "yes"} | {
+        f"{title}, {part}, last epoch (best epoch)": str(reported[key][REPORTED_KEYS[name]])
+        for part, key in (("training", "train"), ("validation", "validation"))
+        for name, title in SCORES.items()
+    }
+    table = pd.DataFrame(facts | {"Cityscapes, thesis": thesis}).fillna("")
+    return table.loc[list(next(iter(facts.values())))].rename_axis("training").reset_index()
+
+
+def streets(settings, labels, out, note):
+    """Compare masks from the label maps with all keypoints, and write both tables."""
+    names = tuple(kitti.sequences(settings.kitti))
+    study = Study(
+        settings.kitti,
+        names,
+        tuple(Source(folder) for folder in labels),
+        (CONTROL_WIDTH,),
+        estimators=("refined", "thesis"),
+        repetitions=settings.sizes.repetitions,
+    )
+    folder = settings.build.parent / "camvid" / "study"
+    table = comparisons.comparisons_of(study.run(folder, settings.jobs).table)
+    over_all = table[(table["reference"] == "baseline") & (table["method"] == "masked")]
+    style.save_table(comparison.table_of_ratios(comparison.all_of(over_all)), out, "streets", note)
+    worths = study.worths(folder, settings.jobs)
+    style.save(report_worths.table_of_worths(worths), out, note)
+
+
+def main(camvid, job="", trained=""):
+    """Train, or read trainings, and write what they give."""
     if not camvid:
         raise InputError("CAMVID: give the folder that holds train, trainannot, val and valannot")
     settings = read_settings()
@@ -156,25 +235,38 @@ def main(camvid):
     )
     out = ROOT / "figures" / "camvid" if is_thesis else root / "figures"
     train_batches, validation, held_out = batches_of(folder(camvid), sizes, settings.seed)
-    stage, history = train(train_batches, validation, sizes, root / "training", settings.seed)
-    model = training.load_model(stage / BEST)
-    network = f"{sizes.base_filters} filters, {sizes.image_size}x{sizes.image_size} pixels"
-    note = f"the thesis's network, {network}, trained on CamVid; {len(history)} epochs"
+    if job:
+        write_job(Path(job), train_batches, validation, sizes, settings.seed)
+        program.summary(f"{job}: written; tools/camvid_jax.py trains it")
+        return
+    if trained:
+        networks, machine = read_trained(Path(trained), sizes)
+    else:
+        stage, history = train(train_batches, validation, sizes, root / "training", settings.seed)
+        networks = {settings.seed: (training.load_model(stage / BEST), history)}
+        machine = timing.processor()
+    histories = {seed: history for seed, (_, history) in networks.items()}
+    model, history = next(iter(networks.values()))
+    size = f"{sizes.base_filters} filters, {sizes.image_size}x{sizes.image_size} pixels"
+    note = f"the thesis's network, {size}, trained on CamVid; {machine}"
     style.save_figure(curves(history), out, "figure_4_01", note)
-    provenance.write_table(out / "figure_4_01.csv", history)
+    rows = pd.concat([rows.assign(seed=seed) for seed, rows in histories.items()])
+    provenance.write_table(out / "figure_4_01.csv", rows)
     style.save_figure(example(model, *held_out), out, "figure_4_03", f"{note}; CamVid, validation")
-    facts = table_of_training(history, sizes.patience, timing.processor())
-    style.save_table(facts, out, "training", note)
+    style.save_table(table_of_training(histories, sizes.patience), out, "training", note)
     domains = {"CamVid, validation": cityscapes.pairs(folder(camvid), "val")}
     if settings.kitti_semantic:
         domains["KITTI's street scenes"] = cityscapes.pairs(settings.kitti_semantic, "train")
-    scores = domain_gap.scores_of_models({"trained on CamVid": model}, domains)
+    by_seed = {f"seed {seed}": model for seed, (model, _) in networks.items()}
+    scores = domain_gap.scores_of_models(by_seed, domains)
     style.save_table(domain_gap.table_of_scores(scores), out, "scores", note)
     if not settings.kitti_is_embedded:
-        for name in kitti.sequences(settings.kitti):
-            paths = kitti.Sequence(settings.kitti, name).frame_paths
-            prediction.write_label_maps(model, paths, root / "labels" / name)
-        program.log.info(f"label maps: {root / 'labels'} (thesis-repro study --labels)")
+        labels = [root / "labels" / f"CamVid, {name}" for name in by_seed]
+        for model, label_folder in zip(by_seed.values(), labels, strict=True):
+            for name in kitti.sequences(settings.kitti):
+                paths = kitti.Sequence(settings.kitti, name).frame_paths
+                prediction.write_label_maps(model, paths, label_folder / name)
+        streets(settings, labels, out, note)
     program.summary(f"curves, scores and an example: {out}")
 
 
