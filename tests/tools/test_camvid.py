@@ -1,4 +1,4 @@
-"""The training of the thesis's network, at tiny size, here and by the program for other machines."""
+"""The training of the thesis's network, at tiny size, here and by the program for elsewhere."""
 
 import json
 import time
