@@ -23,7 +23,7 @@ from thesis_repro.data.memory import are_impossible
 from thesis_repro.errors import InputError, one_line
 from thesis_repro.masks import coverage
 from thesis_repro.masks.folders import LabelMasks, MaskFolder
-from thesis_repro.running import files
+from thesis_repro.running import files, program
 
 MAX_GAP = 10  # intervals between frames
 STANDING = 0.01  # metres; no direction can be told of a shorter step
@@ -210,6 +210,17 @@ def run_warnings(
         ),
     ]
     return [f"sequence {name}: {text}" for applies, text in told if applies]
+
+
+def input_warnings(sequence: kitti.Sequence, mask_sets: Iterable) -> list[str]:
+    """Print what masks of a sequence hold, and return warnings of doubtful input."""
+    warnings = sequence_warnings(sequence)
+    for masks in mask_sets:
+        with suppress(InputError):  # a file that cannot be read is reported when it is used
+            line, of_masks = look_at_masks(masks, sequence)
+            program.log.info(line)
+            warnings += of_masks
+    return warnings
 
 
 def look_at_masks(

@@ -4,6 +4,7 @@ Figures are also written as PDF, across a page and in one column, and tables as 
 """
 
 from collections.abc import Collection, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -19,19 +20,78 @@ from keypoint_study.report.findings import findings_of
 from keypoint_study.report.paths import figure_of_paths
 from keypoint_study.report.style import COLUMN_WIDTH, PAGE_WIDTH, Artefact
 from keypoint_study.sources import KINDS, UNMASKED, FileMasks, Source, own_calls
+from thesis_repro import checks
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.data.trajectories import write_kitti_poses, write_tum
-from thesis_repro.errors import one_line
+from thesis_repro.errors import InputError, one_line
 from thesis_repro.masks import MaskSettings
 from thesis_repro.masks.folders import LabelMasks
 from thesis_repro.odometry import THESIS, metrics
 from thesis_repro.odometry.loop import detect
 from thesis_repro.odometry.runs import inside
-from thesis_repro.running import provenance
+from thesis_repro.running import program, provenance
 from thesis_repro.running.files import write_text
 
 PATHS = "paths"  # folder of the estimated paths
 DRAWN = ("masked", "keypoints")  # methods of what a user brings that acts on frames
+
+
+def make(
+    study: Study,
+    folder: Path,
+    with_worth: bool = True,
+    processes: int = 1,
+    scheduler: str | None = None,
+) -> int:
+    """Run a study, and write its page and tables; what is in the folder is kept.
+
+    Says what it finds doubtful, and where the page is. Without any ground truth, only the worth of
+    keypoints is measured. Returns 1 if a run failed, otherwise 0.
+    """
+    with provenance.claimed(folder):
+        warnings = []
+        for sequence, masks in shown_masks(study):
+            warnings += program.warn(checks.input_warnings(sequence, masks))
+        if not any(sequence.has_truth for sequence in study.opened):
+            of_worths = study.worths(folder, processes, scheduler)
+            if of_worths is not None:  # otherwise the run says that the ground truth is missing
+                file = write_worths(study, of_worths, folder)
+                program.summary(f"no ground truth, so no errors; worth of keypoints: {file}")
+                return 0
+        outcome = study.run(folder, processes, scheduler)
+        runs = outcome.table
+        study = replace(study, sequences=tuple(runs["sequence"].unique()))
+        warnings += outcome.warnings + program.warn(_doubts(study, runs))
+        of_worths = None
+        with_runs = set(runs["source"])
+        measured = tuple(source for source in study.sources if source.name in with_runs)
+        try:
+            if with_worth:
+                program.log.info(
+                    "next is the worth of keypoints, which takes about as long as the runs "
+                    "(--without-worth leaves it out)"
+                )
+                of_worths = replace(study, sources=measured).worths(folder, processes, scheduler)
+        except InputError as error:  # the runs are there, so their page is written
+            warnings += program.warn([f"no worth of keypoints: {error}"])
+        page = write(study, runs, folder, warnings, of_worths)
+    made = f"{len(runs):,} runs, {len(outcome.reasons):,} failed"
+    program.summary(f"{made}; open {page} in a browser", outcome.kept)
+    return int(bool(outcome.reasons))
+
+
+def _doubts(study: Study, runs: pd.DataFrame) -> Iterator[str]:
+    """Yield warnings of the runs, one of each sequence and source at the shown width."""
+    shown = runs["dilation_width"].isna() | (runs["dilation_width"] == study.shown_width)
+    of_shown = runs[shown & runs["method"].isin(("baseline", *DRAWN))]
+    standing = {sequence.name: checks.standing(sequence) for sequence in study.opened}
+    for run in of_shown.drop_duplicates(["sequence", "source"]).itertuples():
+        yield from checks.run_warnings(
+            f"{run.sequence} {run.source}".strip(),
+            run.frames,
+            run.flagged,
+            standing=standing[run.sequence],
+        )
 
 
 @style.applied()

@@ -3,10 +3,8 @@
 import json
 import os
 import sys
-from collections.abc import Iterable
 from contextlib import redirect_stdout, suppress
 from dataclasses import replace
-from itertools import chain
 from math import isnan
 from pathlib import Path
 from typing import Any
@@ -86,12 +84,13 @@ def masks(options: Any) -> None:
 
     Masks are 8-bit PNG images: 255 keeps keypoints, 0 ignores them.
     """
+    from thesis_repro import checks
     from thesis_repro.masks.folders import write_masks
 
     sequence = _sequence(options)
     label_masks = _masks(options, sequence)
     _check_outputs(options, options.labels, sequence.folder)
-    _warn(_check_masks(sequence, [label_masks]))
+    program.warn(checks.input_warnings(sequence, [label_masks]))
     write_masks(label_masks, options.folder)
     program.summary(one_line(f"{options.folder}: {len(label_masks)} masks"))
 
@@ -117,7 +116,7 @@ def odometry(options: Any) -> None:
     sequence = _sequence(options)
     masks = _masks(options, sequence)
     _check_outputs(options, sequence.poses_path, options.masks, options.labels, sequence.folder)
-    _warn(_check_masks(sequence, filter(None, [masks])))
+    program.warn(checks.input_warnings(sequence, filter(None, [masks])))
     result = odometry.run(sequence, settings, masks, description=f"sequence {sequence.name}")
     if options.output:
         result.write_kitti(options.output)
@@ -125,10 +124,10 @@ def odometry(options: Any) -> None:
         result.write_tum(options.tum)
     steps = len(sequence), result.failed_steps, result.dropped_steps
     standing = checks.standing(sequence)
-    _warn(checks.run_warnings(sequence.name, *steps, settings.scale_gate, standing))
+    program.warn(checks.run_warnings(sequence.name, *steps, settings.scale_gate, standing))
     if sequence.has_truth:
         reason = metrics.foreign_poses(sequence.poses, result.poses)
-        _warn([f"{sequence.poses_path}: true {reason}"] * bool(reason))
+        program.warn([f"{sequence.poses_path}: true {reason}"] * bool(reason))
         length = metrics.travelled(sequence.poses)[-1]
         if not reason and length < metrics.CHECKED_LENGTH:
             program.log.info(
@@ -153,10 +152,8 @@ def study(options: Any) -> int:
     """Compare your own masks, keypoints or paths with all keypoints and with controls."""
     from keypoint_study import sources
     from keypoint_study.plan import Study
-    from thesis_repro import checks
     from thesis_repro.data import kitti, layout
     from thesis_repro.masks import WIDTHS
-    from thesis_repro.running import provenance
 
     if not options.sources:
         raise InputError(
@@ -196,49 +193,7 @@ def study(options: Any) -> int:
     # this import takes seconds, so the input is checked first
     from keypoint_study.report import study_report
 
-    with provenance.claimed(folder):
-        warnings = []
-        for sequence, masks in study_report.shown_masks(planned):
-            warnings += _warn(_check_masks(sequence, masks))
-        workers = (options.jobs, options.dask)
-        if not any(sequence.has_truth for sequence in planned.opened):
-            worths = planned.worths(folder, *workers)
-            if worths is not None:  # otherwise the run below says that the ground truth is missing
-                file = study_report.write_worths(planned, worths, folder)
-                program.summary(f"no ground truth, so no errors; worth of keypoints: {file}")
-                return 0
-        outcome = planned.run(folder, *workers)
-        planned = replace(planned, sequences=tuple(outcome.table["sequence"].unique()))
-        table = outcome.table
-        shown = table["dilation_width"].isna() | (table["dilation_width"] == planned.shown_width)
-        runs = table[shown & table["method"].isin(("baseline", "masked", "keypoints"))]
-        standing = {sequence.name: checks.standing(sequence) for sequence in planned.opened}
-        of_runs = [
-            checks.run_warnings(
-                f"{run.sequence} {run.source}".strip(),
-                run.frames,
-                run.flagged,
-                standing=standing[run.sequence],
-            )
-            for run in runs.drop_duplicates(["sequence", "source"]).itertuples()
-        ]
-        warnings += outcome.warnings + _warn(chain(*of_runs))
-        worths = None
-        with_runs = set(outcome.table["source"])
-        measured = [source for source in planned.sources if source.name in with_runs]
-        try:
-            if not options.without_worth:
-                program.log.info(
-                    "next is the worth of keypoints, which takes about as long as the runs "
-                    "(--without-worth leaves it out)"
-                )
-                worths = replace(planned, sources=tuple(measured)).worths(folder, *workers)
-        except InputError as error:  # the runs are there, so their page is written
-            warnings += _warn([f"no worth of keypoints: {error}"])
-        page = study_report.write(planned, outcome.table, folder, warnings, worths)
-    made = f"{len(outcome.table):,} runs, {len(outcome.reasons):,} failed"
-    program.summary(f"{made}; open {page} in a browser", outcome.kept)
-    return int(bool(outcome.reasons))
+    return study_report.make(planned, folder, not options.without_worth, options.jobs, options.dask)
 
 
 COMMANDS = {
@@ -357,27 +312,6 @@ def _sequence(options: Any) -> Any:
     if vars(options).get("without_border"):
         return sequence.without_border()
     return sequence
-
-
-def _check_masks(sequence: Any, mask_sets: Iterable) -> list[str]:
-    """Print what masks of a sequence hold, and return warnings of doubtful input."""
-    from thesis_repro import checks
-
-    warnings = checks.sequence_warnings(sequence)
-    for masks in mask_sets:
-        with suppress(InputError):  # a file that cannot be read is reported when it is used
-            line, of_masks = checks.look_at_masks(masks, sequence)
-            program.log.info(line)
-            warnings += of_masks
-    return warnings
-
-
-def _warn(lines: Iterable[str]) -> list[str]:
-    """Print warnings, and return them."""
-    warnings = list(lines)
-    for line in warnings:
-        program.log.warning(line)
-    return warnings
 
 
 def _image_folders(root: Path, calibration: Path | None = None) -> list[tuple[Path, list, Any]]:

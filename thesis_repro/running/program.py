@@ -6,7 +6,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from datetime import timedelta
 from multiprocessing import resource_tracker
@@ -39,6 +39,14 @@ def print_messages() -> None:
     log.handlers = [_Printer()]
     log.setLevel(logging.INFO)
     log.propagate = False
+
+
+def warn(lines: Iterable[str]) -> list[str]:
+    """Print warnings, and return them."""
+    warnings = list(lines)
+    for line in warnings:
+        log.warning(line)
+    return warnings
 
 
 def explain(error: BaseException) -> str | None:
