@@ -50,8 +50,21 @@ def random_keypoints(sequence: Sequence, amount: int | float, index: int) -> np.
     points = all_keypoints(sequence, index).astype(int)
     if isinstance(amount, float):
         amount = round(amount * len(points))
+    return _kept(sequence, points, amount, index)
+
+
+def random_keypoints_on(
+    label_masks: LabelMasks, sequence: Sequence, number: int, index: int
+) -> np.ndarray:
+    """Return a mask that keeps randomly drawn keypoints on the mask of a frame, one pixel each."""
+    points = detect(sequence.frame(index), THESIS, label_masks[index]).astype(int)
+    return _kept(sequence, points, number, index)
+
+
+def _kept(sequence: Sequence, points: np.ndarray, number: int, index: int) -> np.ndarray:
+    """Return a mask that keeps so many of some keypoints of a frame, one pixel each."""
     shuffled = np.random.default_rng((0, index)).permutation(points)
-    columns, rows = shuffled[:amount].T
+    columns, rows = shuffled[:number].T
     mask = np.zeros(sequence.size, np.uint8)
     mask[rows, columns] = 255
     return mask

@@ -102,9 +102,17 @@ def spread_out(asked: Asked) -> Choice:
     return replace(THESIS, detector=spread(asked.number or FEW_SPREAD)), None
 
 
-def altered(make: Callable, *values: Any) -> Callable[[Asked], Choice]:
-    """Return a method with masks that a function makes from those of the source."""
-    return lambda asked: (THESIS, MadeMasks(make, masked(asked)[1], values))
+def drawn_on_masks(asked: Asked) -> Choice:
+    """Run with random keypoints of those on the masks, as many as are asked for."""
+    values = asked.sequence, asked.number or FEW_SPREAD
+    return THESIS, MadeMasks(ablations.random_keypoints_on, masked(asked)[1], values)
+
+
+def altered(
+    make: Callable, *values: Any, of: Callable[[Asked], Choice] = masked
+) -> Callable[[Asked], Choice]:
+    """Return a method with masks that a function makes from those of another one."""
+    return lambda asked: (THESIS, MadeMasks(make, of(asked)[1], values))
 
 
 def with_lines(make: Callable) -> Callable[[Asked], Choice]:
@@ -249,6 +257,7 @@ METHODS = {  # in the order in which they are shown
     "strongest-on": Method(
         "strongest on the masks", BROUGHT, strongest(masked), {FEW: {ALL, EACH}, WORTH: {DECIDING}}
     ),
+    "random-on": Method("random on the masks", BROUGHT, drawn_on_masks, {FEW: {FEW_SPREAD}}),
     "filled": Method(
         "masks, filled", ALTERED, found_by(filled(FILL), masked), {FEW: {ALL}, WORTH: {DECIDING}}
     ),
@@ -273,9 +282,18 @@ METHODS = {  # in the order in which they are shown
         "reduced keypoints", THESIS_ONLY, strongest(all_keypoints), {CHAPTER_4: {AS_MANY}}
     ),
 }
-# Whether it is what lies under the masks, or where in the frame they are: keypoints beside the
-# masks, and few that are spread over the frame, on the masks or off them.
+# Whether it is what lies under the masks, or where in the frame they are: exact boundaries in
+# mirrored places, keypoints beside the masks, and few that are spread over the frame, on the masks
+# or off them.
 IN_PLACE = {
+    "mirrored-exact": Method(
+        "mirrored exact boundaries",
+        LABEL_MAPS,
+        altered(controls.mirrored, of=METHODS["exact-boundaries"].choose),
+        IF_NAMED,
+    )
+}
+IN_PLACE |= {
     f"beside-{name}": Method(
         f"beside the {METHODS[name].title}",
         LABEL_MAPS,
@@ -283,7 +301,8 @@ IN_PLACE = {
         IF_NAMED,
     )
     for name in ("masked", "exact-boundaries", "mirrored")
-} | {
+}
+IN_PLACE |= {
     f"spread-{where}": Method(
         f"{FEW_SPREAD} spread {words} the masks",
         LABEL_MAPS,
@@ -348,7 +367,7 @@ def of_group(group: str) -> list[str]:
 def with_numbers(place: str, numbers: Iterable[int]) -> list[tuple[str, int]]:
     """Return (method, number of keypoints) for each number, 0 for no limit, in a place.
 
-    Those that the place has with the deciding number alone come last.
+    Those that the place has with a number of their own, such as the deciding one, come last.
     """
     asked = {name: METHODS[name].where[place] for name in compared_in(place)}
     each = [
@@ -357,4 +376,5 @@ def with_numbers(place: str, numbers: Iterable[int]) -> list[tuple[str, int]]:
         for name in asked
         if (EACH if number else ALL) in asked[name]
     ]
-    return each + [(name, DECIDING) for name in asked if DECIDING in asked[name]]
+    own = [(name, number) for name in asked for number in asked[name]]
+    return each + [(name, number) for name, number in own if number not in (ALL, EACH, AS_MANY)]

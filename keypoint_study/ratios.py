@@ -141,7 +141,7 @@ def has_failed(runs: pd.DataFrame) -> pd.Series:
 
 
 def count_failed(runs: pd.DataFrame) -> str:
-    """Return how many of some runs failed, such as "2 of 40"."""
+    """Return how many runs of one sequence failed, such as "2 of 5"."""
     return f"{has_failed(runs).sum()} of {len(runs)}"
 
 
@@ -151,6 +151,11 @@ def failing_sequences(failed: pd.Series) -> int:
     failed: of each run, by sequence (index). Repetitions are no units, so a sequence counts once.
     """
     return int((failed.groupby(level=0).mean() >= 0.5).sum())
+
+
+def count_failing(failed: pd.Series) -> str:
+    """Return on how many sequences half of the runs or more have failed, such as "1 of 11"."""
+    return f"{failing_sequences(failed)} of {failed.index.nunique()}"
 
 
 def range_over_repetitions(

@@ -206,7 +206,7 @@ def runs_of_widths(settings, sequences, labels):
 
 
 def table_of_widths(runs):
-    """Return one row a width: errors divided by those with all keypoints, and failed runs."""
+    """Return one row a width: errors divided by those with all keypoints, and what fails."""
     everything = comparisons.of_method(runs, "baseline", "refined")
     masked = comparisons.of_method(runs, "masked", "refined")
     rows = []
@@ -216,7 +216,8 @@ def table_of_widths(runs):
         for error, title in comparisons.JUDGING_METRICS.items():
             ratio = ratios.typical_ratio(ratios.ratios_of(of_width, everything, error))
             row[title] = f"{texts.short(ratio)}, {ratio['above']} of {ratio['n']} above 1"
-        rows.append(row | {"failed runs": ratios.count_failed(of_width)})
+        failed = ratios.has_failed(of_width.set_index("sequence"))
+        rows.append(row | {"streets that fail": ratios.count_failing(failed)})
     return pd.DataFrame(rows)
 
 

@@ -23,6 +23,7 @@ SHOWN = {"thesis": "thesis's estimator", "refined": "refined estimator"}
 # choice and number of keypoints (0: no limit), and those of what it is compared with
 PAIRS = {
     ("200 strongest on the mask", "200 random ones"): (("mask", 200), ("random", 200)),
+    ("200 random ones on the mask", "200 random ones"): (("random-on", 200), ("random", 200)),
     ("100 strongest on the mask", "100 random ones"): (("mask", 100), ("random", 100)),
     ("200 strongest on the mask", "200 strongest"): (("mask", 200), ("strongest", 200)),
     ("200 strongest", "200 random ones"): (("strongest", 200), ("random", 200)),
@@ -104,8 +105,7 @@ def hangs_on(of_streets: pd.DataFrame, new: Collection[str]) -> dict[str, Any]:
 def failing(runs: pd.DataFrame) -> str:
     """Return on how many streets half of the runs or more have failed: "1 of 11"."""
     failed = ratios.has_failed(runs) if "lost" in runs else runs["failed"] > 0
-    failed = failed.set_axis(runs["sequence"])
-    return f"{ratios.failing_sequences(failed)} of {runs['sequence'].nunique()}"
+    return ratios.count_failing(failed.set_axis(runs["sequence"]))
 
 
 def table_of_pairs(few: pd.DataFrame, runs: pd.DataFrame, new: Collection[str]) -> pd.DataFrame:

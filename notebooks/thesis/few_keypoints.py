@@ -41,6 +41,7 @@ LABELS = {CALLED.get(name, name): METHODS[name].title for name in compared_in(FE
     "strongest": "the strongest",
     "spread": "spread over the frame",
     "mask": "the strongest on the mask",
+    "random-on": "random ones on the mask",
     "filled": f"mask, filled to {FILL} a field",
 }
 ERRORS = comparisons.JUDGING_METRICS
@@ -142,7 +143,7 @@ def ratios_to_all(runs: pd.DataFrame) -> pd.DataFrame:
         word = "" if choice == "all" else verdict_on(chosen, reference)
         for estimator, of_estimator in chosen.groupby("estimator", sort=False):
             of_all = reference[reference["estimator"] == estimator]
-            failed = of_estimator["failed"]
+            failed = of_estimator.set_index("sequence")["failed"] > 0
             for error in ERRORS:
                 numbers = ratios.typical_ratio(ratios.ratios_of(of_estimator, of_all, error))
                 row = {
@@ -152,7 +153,7 @@ def ratios_to_all(runs: pd.DataFrame) -> pd.DataFrame:
                     "estimator": estimator,
                     "error": error,
                     **{name: numbers[name] for name in ("ratio", "low", "high", "n", "above")},
-                    "failed": f"{failed.sum()} of {len(failed)}",
+                    "failed": ratios.count_failing(failed),
                     "verdict": word,
                 }
                 rows.append(row)
@@ -190,7 +191,7 @@ def table_of_few(rows: pd.DataFrame, times: pd.DataFrame | None = None) -> pd.Da
             name = f"{ERRORS[row['error']]}, {ESTIMATORS[row['estimator']]}"
             line[name] = f"{texts.short(row)}, {row['above']} of {row['n']}"
         for row in chosen.drop_duplicates("estimator").itertuples():
-            line[f"failed, {ESTIMATORS[row.estimator]}"] = row.failed
+            line[f"sequences that fail, {ESTIMATORS[row.estimator]}"] = row.failed
         if times is not None:
             line["CPU time a frame (ms)"] = milliseconds.get((choice, number))
         lines.append(line | {"verdict": chosen["verdict"].iloc[0]})

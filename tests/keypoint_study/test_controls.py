@@ -112,7 +112,7 @@ def test_a_methods_own_settings_win_and_nothing_joins_a_study_unasked(
     assert worth["strongest"] == replace(THESIS, max_keypoints=400)
 
 
-@pytest.mark.parametrize("place, count", [(methods.ABLATIONS, 21), (methods.FEW, 6)])
+@pytest.mark.parametrize("place, count", [(methods.ABLATIONS, 21), (methods.FEW, 7)])
 def test_ablations_and_few_keypoints_are_those_of_the_one_table(place, count):
     assert len(methods.compared_in(place)) == count
 

@@ -134,6 +134,6 @@ def test_a_sweep_has_one_row_a_width():
     )
     runs.loc[(runs["dilation_width"] == 1) & (runs["sequence"] == "03"), "lost"] = 1
     table = evidence.table_of_widths(runs).set_index("dilation width (pixels)")
-    ratio, failed = table.loc[1, ["rotational RPE, 1 frame", "failed runs"]]
+    ratio, failed = table.loc[1, ["rotational RPE, 1 frame", "streets that fail"]]
     assert ratio == "1.20 (1.20-1.20) ↑, 8 of 8 above 1" and failed == "1 of 8"
     assert table.loc[10, "rotational RPE, 1 frame"].endswith("0 of 8 above 1")
