@@ -87,7 +87,13 @@ CONSTANTS = {
         "MAX_ROTATION_STD": 0.5,
         "MAX_HEADING_STD": 5.0,
     },
-    verdicts: {"LEVEL": 95, "NARROW_LEVEL": 90, "MIN_SEQUENCES": 6, "DISAGREEING": 2},
+    verdicts: {
+        "LEVEL": 95,
+        "NARROW_LEVEL": 90,
+        "MIN_SEQUENCES": 6,
+        "DISAGREEING": 2,
+        "TOO_FAR": {"less": 1.5, "more": 1.5, "no clear difference": 1.5, "as much": 1.25},
+    },
     ratios: {"MIN_FOR_INTERVAL": 3, "FAR_OFF": 3},
     cityscapes: {"N_CLASSES": 35},
 }

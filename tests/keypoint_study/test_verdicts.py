@@ -39,6 +39,18 @@ def test_the_word_is_that_of_the_rule_and_five_sequences_have_none(rule, outcome
     assert verdict(rule, 5, **outcome) == verdicts.TOO_FEW
 
 
+@pytest.mark.parametrize(
+    "sides, narrow, word, limit",
+    [([-1] * 4, [], "less", 1.5), ([1] * 4, [], "more", 1.5), ([0], ALIKE, "as much", 1.25)],
+)
+def test_no_word_stands_where_the_measure_is_too_far_from_the_truth(sides, narrow, word, limit):
+    words = [
+        verdict(WORTH, 6, sides, narrow, off=off) for off in (1, limit, limit + 0.01, float("nan"))
+    ]
+    assert words == [word, word, verdicts.NOT_JUDGED, word]
+    assert verdict(WORTH, 5, sides, narrow, off=9) == verdicts.TOO_FEW
+
+
 MARGINS = [
     (FEW_KEYPOINTS, "se3", 1.25, "as good", "no worse", "neither"),
     (FEW_KEYPOINTS, "rotation", 1.1, "as good", "no worse", "neither"),
