@@ -5,8 +5,8 @@ estimator, repetition, frames, mean_keypoints, flagged, and one column for each 
 
 **Comparisons** (`comparisons_of`) have one row for each method, reference, metric and estimator:
 the ratio of the method's error to the reference's with its interval (`ratios`), a verdict
-(`verdicts.ERRORS`), on how many sequences each fails, and the ratio of every sequence. The rows that
-answer the main question are those that `decide`.
+(`verdicts.ERRORS`), on how many sequences each fails, and the ratio of every sequence. The rows
+that answer the main question are those that `decide`.
 
 The functions below it select parts of a table of runs.
 """
@@ -131,8 +131,9 @@ def sequences_of(table: pd.DataFrame) -> list[str]:
 def failures(failed: pd.Series, reference: pd.Series) -> dict[str, Any]:
     """Compare how often runs fail. failed, reference: of each run, by sequence (index).
 
-    Returns {failed, reference_failed (`ratios.count_failing`); more_failures, fewer_failures (sequences
-    on which a larger or a smaller share of runs failed than with the reference); failures_verdict}.
+    Returns {failed, reference_failed (`ratios.count_failing`); more_failures, fewer_failures
+    (sequences on which a larger or a smaller share of runs failed than with the reference);
+    failures_verdict}.
     """
     shares, reference_shares = (runs.groupby(level=0).mean() for runs in (failed, reference))
     differences = (shares - reference_shares).dropna()

@@ -49,8 +49,8 @@ class Rule(NamedTuple):
 ERRORS = Rule(LOWER, HIGHER)
 # of shares of failed runs, by the sign test
 FAILURES = Rule(LOWER, HIGHER)
-# A word about a side can be right where a size is not, so it stands up to a factor of 1.5 (the worths
-# that it was made for are off 1 by 2 and more). AS_MUCH is about a size, so its margin is the limit.
+# A word about a side can be right where a size is not, so it stands up to a factor of 1.5; AS_MUCH
+# is about a size, so its margin is the limit.
 TOO_FAR = {LESS: 1.5, MORE: 1.5, NO_CLEAR_DIFFERENCE: 1.5, AS_MUCH: 1.25}
 # of what a keypoint is worth, compared with random ones
 WORTH = Rule(LESS, MORE, AS_MUCH, margins={"rotation": 1.25, "direction": 1.25}, too_far=TOO_FAR)

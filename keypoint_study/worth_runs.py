@@ -17,6 +17,7 @@ from keypoint_study.runner import Measure, run_all
 from keypoint_study.sources import Source, own_calls
 from keypoint_study.verdicts import verdict
 from keypoint_study.worth import MOTIONS, ONE_FIT, worth_of
+from keypoint_study.worth_check import OVER, factor_off
 from thesis_repro.data.kitti import Sequence
 
 
@@ -77,7 +78,8 @@ def typical_worths(table: pd.DataFrame, new: Collection[str] = ()) -> pd.DataFra
     table: of `worth_of`, of several sequences. new: those on which nothing was chosen.
     One row a choice and number: keypoints, n (sequences), verdict; for each motion and split, such
     as rotation_fields: the typical worth, its interval (_low, _high), and the number of sequences
-    with a worth below 1 (_below). verdict_of_fit: that of the second measure; it decides nothing.
+    with a worth below 1 (_below). off: `worth_check.factor_off`. verdict_of_fit: that of the second
+    measure; it decides nothing.
     """
     rows = []
     for (choice, number), chosen in table.groupby(["choice", "number"], sort=False):
@@ -90,7 +92,8 @@ def typical_worths(table: pd.DataFrame, new: Collection[str] = ()) -> pd.DataFra
         of_halves = {name: worths[name] for name in worths if name not in of_fit}
         row |= {
             "n": chosen["sequence"].nunique(),
-            "verdict": _verdict(of_halves, new_disagree(chosen, new)),
+            "off": (off := factor_off(choice, number)),
+            "verdict": _verdict(of_halves, new_disagree(chosen, new), off),
         }
         if of_fit:
             row["verdict_of_fit"] = _verdict(of_fit)
@@ -107,7 +110,7 @@ def over(table: pd.DataFrame, choice: str, other: str) -> pd.DataFrame:
     keys, names = ["sequence", "number", "split"], list(MOTIONS)
     first, second = (table[table["choice"] == name].set_index(keys) for name in (choice, other))
     divided = (first[names] / second[names]).dropna()
-    rows = first.loc[divided.index].assign(choice=f"{choice}, over {other}", **divided)
+    rows = first.loc[divided.index].assign(choice=f"{choice}{OVER}{other}", **divided)
     return rows.reset_index()[list(table)]
 
 
@@ -122,7 +125,7 @@ def new_disagree(chosen: pd.DataFrame, new: Collection[str]) -> bool:
     )
 
 
-def _verdict(worths: Mapping[str, pd.Series], new_disagree: bool = False) -> str:
+def _verdict(worths: Mapping[str, pd.Series], new_disagree: bool = False, off: float = 1) -> str:
     """Return the verdict on the logarithms of the worths of both motions and splits, by name."""
     fewest = min(map(len, worths.values()))
     intervals = [ratios.typical_interval(each)[1:] for each in worths.values()]
@@ -131,4 +134,4 @@ def _verdict(worths: Mapping[str, pd.Series], new_disagree: bool = False) -> str
         (name.partition("_")[0], *ratios.narrow_interval(np.exp(each)))
         for name, each in worths.items()
     ]
-    return verdict(verdicts.WORTH, fewest, sides, narrow, new_disagree=new_disagree)
+    return verdict(verdicts.WORTH, fewest, sides, narrow, new_disagree=new_disagree, off=off)

@@ -2,10 +2,10 @@
 
 `make evidence KITTI=...` runs `make figures PROFILE=thesis` with all sequences of a KITTI folder
 and the label maps of the model in the package. Then this program copies the tables, the runs and
-the figures that show no frame of the data. It adds what the streets show, few keypoints, the worth
-of a keypoint, and the refined estimator with masks of every width. It says what is left. A stopped
-run resumes. The frames of the manifest (`make excerpts`) are written to figures/kitti_excerpts,
-other frames beside it.
+the figures that show no frame of the data. It adds what the streets show, few keypoints, the same
+with every second frame, the worth of a keypoint, and the refined estimator with masks of every
+width. It says what is left. A stopped run resumes. The frames of the manifest (`make excerpts`) are
+written to figures/kitti_excerpts, other frames beside it.
 """
 
 import sys
@@ -39,6 +39,12 @@ KEPT = (
     "budget",
 )
 NEW_STREETS = ("03", "04", "drive0009")  # docs/reading-results.md has their rule
+# whether it is the boundaries: masks and exact boundaries over what lies in mirrored places
+MIRRORED = (
+    ("masked", "mirrored"),
+    ("exact-boundaries", "mirrored-exact"),
+    ("exact-boundaries", "mirrored"),
+)
 RUNS = ("runs", "shuffled_runs", "ablations")  # tables of runs in the build folder
 # What the sequences show at their start: 00 to 10 are KITTI odometry's, the others raw drives.
 STREETS = {
@@ -81,6 +87,7 @@ def write(settings, folder):
         "few keypoints": lambda: few_keypoints.run_few(
             sequences, labels, few_folder, settings.jobs, few_keypoints.REPETITIONS
         ),
+        "every second frame": lambda: runs_of_every_second(settings, sequences, labels),
         "their times": lambda: few_keypoints.time_steps(sequences[0], labels, few_folder),
         "worth of a keypoint": lambda: worth_runs.worths_of(
             sequences,
@@ -99,7 +106,7 @@ def write(settings, folder):
         started = time.monotonic()
         made.append(make())
         print(f"{name}: done in {time.monotonic() - started:.0f} s", flush=True)
-    few_runs, times, worths, of_widths = made
+    few_runs, second_runs, times, worths, of_widths = made
     times = timing.recorded(settings, "few_keypoints", times)
     few = few_keypoints.ratios_to_all(few_runs)
     streets = _streets(sequences)
@@ -117,6 +124,7 @@ def write(settings, folder):
     for_readers = {
         "streets": streets,
         "few_keypoints": few_keypoints.table_of_few(few, times),
+        "every_second": few_keypoints.table_of_few(few_keypoints.ratios_to_all(second_runs)),
         "refined_widths": table_of_widths(of_widths),
         "in_place": table_of_places(worths),
         "left_out": table_of_classes(worths),
@@ -127,6 +135,7 @@ def write(settings, folder):
         style.save_table(rows, folder, name, note + timed_on)
     tables = {name: _read(settings, name) for name in RUNS} | {
         "few_keypoints_runs": few_runs,
+        "every_second_runs": second_runs,
         "worth_runs": worths,
         "refined_widths_runs": of_widths,
     }
@@ -188,6 +197,23 @@ def _copy(source, name, folder):
         write_text(folder / path.name, path.read_text(encoding="utf-8"))
 
 
+def runs_of_every_second(settings, sequences, labels):
+    """Run masks and few spread keypoints with every second frame: KITTI at 5 frames a second."""
+    folder = settings.build / "every_second"
+    thinned = [
+        excerpts.cut(each, 0, len(each) - 1, folder / "frames", each.name, every=2)
+        for each in sequences
+    ]
+    return few_keypoints.run_few(
+        thinned,
+        labels,
+        folder / "runs",
+        settings.jobs,
+        few_keypoints.REPETITIONS,
+        only=few_keypoints.EVERY_SECOND,
+    )
+
+
 def runs_of_widths(settings, sequences, labels):
     """Run the refined estimator with all keypoints and with masks of every width, once each.
 
@@ -227,11 +253,12 @@ def not_explored(worths):
 
 
 def table_of_places(worths):
-    """Return what masks tell, what keypoints beside them tell, and the one over the other."""
+    """Return what masks tell, what mirrored ones and keypoints beside them tell, and the ratios."""
     titles = {name: METHODS[name].title for name in METHODS}
     of_masks = ["masked", "exact-boundaries", "mirrored"]
     shown = [titles[name] for name in (*of_masks, *IN_PLACE)]
-    divided = [worth_runs.over(worths, titles[name], titles[f"beside-{name}"]) for name in of_masks]
+    pairs = [*MIRRORED, *((name, f"beside-{name}") for name in of_masks)]
+    divided = [worth_runs.over(worths, titles[name], titles[other]) for name, other in pairs]
     chosen = worths[worths["choice"].isin(shown) & (worths["number"] == worth_runs.DECIDING)]
     decisive = [rows[rows["number"] == worth_runs.DECIDING] for rows in divided]
     return report_worths.table_of_worths(pd.concat([chosen, *decisive]), NEW_STREETS).content

@@ -11,9 +11,10 @@ from typing import Any
 
 import pandas as pd
 
-from keypoint_study import comparisons, ratios, verdicts, worth_runs
+from keypoint_study import comparisons, ratios, verdicts, worth_check, worth_runs
 from keypoint_study import worth as worths
-from keypoint_study.report import texts
+from keypoint_study.report import style, texts
+from keypoint_study.report import worths as report_worths
 from thesis import claims, equal_number, few_keypoints
 from thesis.settings import ROOT
 from thesis_repro.command import cli
@@ -27,6 +28,7 @@ WRITTEN |= {
     f"{name}.md.j2": ROOT / f"docs/{name}.md" for name in ("answer", "reading-results", "options")
 }
 REAL = "kitti_excerpts/"  # tables on real frames
+WORLD = "odometry: embedded world, 11 drives of 25 frames; label maps by the model in the package"
 # how the texts say a verdict on errors
 ERRORS = {
     verdicts.LOWER: "lower than",
@@ -116,14 +118,20 @@ def worth(
     return {"ratio": row[name], **ends, "n": row["n"], "verdict": row["verdict"], "of_fit": of_fit}
 
 
-def random_apart(number: int) -> list[str]:
-    """Return which worths of random keypoints have an interval without 1: the check of the rule."""
-    apart = []
-    for motion, split in product(worths.MOTIONS, worths.SPLIT):
-        row = worth("random keypoints", motion, split, number=number)
-        if ratios.side_of_one(row["low"], row["high"]):
-            apart.append(f"{motion} by {split}, {with_interval(row)}")
-    return apart
+def factor_off(choice: str, number: int = 400) -> float:
+    """Return by what factor the worth of a choice is off in the embedded world."""
+    return worth_check.factor_off(choice, number)
+
+
+def checks_off() -> list[str]:
+    """Return which worths are too far off the truth for any word."""
+    factors = {key: worth_check.factor_off(*key) for key in worth_check.checks().index}
+    limit = verdicts.TOO_FAR[verdicts.LESS]
+    return [
+        f"{number} {choice}, {two(factor)}"
+        for (choice, number), factor in factors.items()
+        if factor > limit
+    ]
 
 
 def new_streets_disagree(choice: str) -> bool:
@@ -139,14 +147,19 @@ def on_new_streets(choice: str, motion: str) -> str:
 
 
 def few(
-    choice: str, number: int, metric: str, estimator: str = "refined", over: str = "all"
+    choice: str,
+    number: int,
+    metric: str,
+    estimator: str = "refined",
+    over: str = "all",
+    table: str = "few_keypoints",
 ) -> dict[str, Any]:
     """Return the numbers of `ratios.typical_ratio` for so many keypoints, and more.
 
     end: the upper end of the interval of NARROW_LEVEL. failing: on how many streets half of the
-    runs fail. failures: the verdict on more or fewer failures.
+    runs fail. failures: the verdict on more or fewer failures. table: or every_second.
     """
-    runs = read_table(f"{REAL}few_keypoints_runs").query("estimator == @estimator")
+    runs = read_table(f"{REAL}{table}_runs").query("estimator == @estimator")
     chosen = runs.query("choice == @choice and number == @number")
     reference = runs.query("choice == @over and number in (0, @number)")
     of_streets = ratios.ratios_of(chosen, reference, metric)
@@ -278,7 +291,8 @@ FUNCTIONS = (
     keypoints_of_controls,
     by_chance,
     worth,
-    random_apart,
+    factor_off,
+    checks_off,
     new_streets_disagree,
     on_new_streets,
     few,
@@ -300,6 +314,7 @@ def write_tables() -> None:
     """Write the tables that are made from other tables in git, and their figure."""
     folder = ROOT / "figures" / REAL
     equal_number.write(lambda name: read_table(f"{REAL}{name}"), folder, data_note())
+    style.save(report_worths.table_of_checks(), ROOT / "figures", WORLD)
     write_text(folder / "claims.md", claims.text_of_claims(all_claims(), data_note()))
 
 

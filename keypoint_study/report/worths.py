@@ -1,16 +1,17 @@
 """Table and figure of what a keypoint of each choice is worth (keypoint_study/worth.py)."""
 
 from collections.abc import Collection
+from itertools import product
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from keypoint_study import ratios
+from keypoint_study import ratios, worth_check
 from keypoint_study.methods import DECIDING
 from keypoint_study.report import style, texts
 from keypoint_study.report.style import COLUMN_WIDTH, PAGE_WIDTH, Artefact
-from keypoint_study.verdicts import LEVEL, MIN_SEQUENCES
+from keypoint_study.verdicts import LEVEL, MIN_SEQUENCES, NOT_JUDGED, TOO_FAR
 from keypoint_study.worth import FIELD, SPLIT
 from keypoint_study.worth_runs import typical_worths
 
@@ -35,6 +36,7 @@ def table_of_worths(worths: pd.DataFrame, new: Collection[str] = ()) -> Artefact
         for split in SPLIT:
             for motion in SHOWN:
                 line[f"{motion}, by {split}"] = cell(row, f"{motion}_{split}")
+        line["factor off the truth"] = "" if np.isnan(row["off"]) else f"{row['off']:.2f}"
         line["a keypoint tells"] = row["verdict"]
         if "verdict_of_fit" in row:
             line["by one fit"] = row["verdict_of_fit"]
@@ -46,8 +48,32 @@ def table_of_worths(worths: pd.DataFrame, new: Collection[str] = ()) -> Artefact
         f"the number of sequences with less than random keypoints. By fields: squares of {FIELD} "
         "pixels go into one half as a whole, so what neighbours share counts once. By points: "
         "keypoint by keypoint. A keypoint tells less or more only if both splits say so, for "
-        "direction and rotation. By one fit: what the covariance of a single fit says, which decides "
+        "direction and rotation. Factor off the truth: the largest in the embedded world, where the "
+        "truth is known, for the choices that were checked; where it is too large, the row is not "
+        "judged. By one fit: what the covariance of a single fit says, which decides "
         "nothing. worth_runs.csv has every sequence.",
+        pd.DataFrame(lines),
+    )
+
+
+def table_of_checks() -> Artefact:
+    """Return `worth_check.TABLE` for readers: worths beside the truth, and what stays unjudged."""
+    lines = []
+    for (choice, number), row in worth_check.checks().iterrows():
+        off = worth_check.factor_off(choice, number)
+        line = {"choice": choice, "keypoints": number}
+        for motion, kind in product(SHOWN, (worth_check.TRUE, *SPLIT)):
+            head = kind if kind == worth_check.TRUE else f"by {kind}"
+            line[f"{motion}, {head}"] = f"{row[f'{motion}_{kind}']:.2f}"
+        line["factor off"] = f"{off:.2f}"
+        words = [word for word, limit in TOO_FAR.items() if off <= limit]
+        line["words that may be said"] = ", ".join(words) or NOT_JUDGED
+        lines.append(line)
+    return Artefact(
+        "worth_check",
+        "The worth of a keypoint beside the truth",
+        "Typical worths of rendered drives, where the motion of every step is exact: the true worth, "
+        "and what halves of the keypoints say without a truth. Factor off: the largest of the four.",
         pd.DataFrame(lines),
     )
 

@@ -67,15 +67,19 @@ def are_those_of_the_evidence(root: Path) -> bool:
     return not any(differences(each, manifest.loc[each.name]) for each in sequences)
 
 
-def cut(sequence: kitti.Sequence, first: int, last: int, root: Path, name: str) -> kitti.Sequence:
+def cut(
+    sequence: kitti.Sequence, first: int, last: int, root: Path, name: str, every: int = 1
+) -> kitti.Sequence:
     """Write some frames of a sequence as a sequence of a root in KITTI's layout, and return it.
 
-    first, last: numbers of frames, from 0 on, the last one included. Frames are links; poses, times
+    first, last: numbers of frames, from 0 on, the last one included. every: 2 takes every second of
+    them. Frames are links; poses, times
     and camera have seven digits, as KITTI's own files. Raises InputError if frames are missing, or
     if the camera has distortion.
     """
-    frames = sequence.frame_paths[first : last + 1]
-    if len(frames) != last - first + 1:
+    kept = slice(first, last + 1, every)
+    frames = sequence.frame_paths[kept]
+    if len(frames) != len(range(first, last + 1, every)):
         raise InputError(
             f"{sequence.folder}: has {len(sequence)} frames; {first} to {last} are wanted"
         )
@@ -83,10 +87,10 @@ def cut(sequence: kitti.Sequence, first: int, last: int, root: Path, name: str) 
         raise InputError(f"{sequence.folder}: has distortion; only KITTI's frames are cut")
     folder = root / "sequences" / name
     projection = np.column_stack([sequence.intrinsics, np.zeros(3)])
-    poses = sequence.poses[first : last + 1, :3].reshape(-1, 12)
+    poses = sequence.poses[kept, :3].reshape(-1, 12)
     texts = {
         folder / "calib.txt": "P0: " + _lines([projection.ravel()]),
-        folder / "times.txt": _lines(sequence.times[first : last + 1, None]),
+        folder / "times.txt": _lines(sequence.times[kept, None]),
         root / "poses" / f"{name}.txt": _lines(poses),
     }
     links = {folder / "image_0" / frame.name: str(frame.resolve()) for frame in frames}

@@ -7,7 +7,7 @@ that of both errors and both estimators together. Its rule was fixed before the 
 show, but when a prototype's results on the same streets were known.
 """
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from itertools import product
 from pathlib import Path
 from time import process_time
@@ -56,6 +56,8 @@ COLUMNS = (
     "rotation",
     "failed",
 )
+# choices and numbers that are run with every second frame, too
+EVERY_SECOND = (("all", 0), ("mask", 0), ("spread", 200))
 NEAR = 0.8, 1.5  # of the panels that show ratios near 1 enlarged
 
 
@@ -88,14 +90,20 @@ def run_few(
     processes: int = 1,
     repetitions: int = REPETITIONS,
     numbers: Iterable[int] = (),
+    only: Collection[tuple[str, int]] = (),
 ) -> pd.DataFrame:
     """Run all choices on sequences. Returns one row a run; finished runs are not repeated.
 
     labels: a folder with one folder of label maps a sequence. folder: of the results. numbers: of
-    keypoints, NUMBERS if there are none.
+    keypoints, NUMBERS if there are none. only: (choice, number) of those that are run, all if none.
     """
     sequences = list(sequences)
-    listed = [job for sequence in sequences for job in jobs_of(sequence, numbers).values()]
+    listed = [
+        job
+        for sequence in sequences
+        for key, job in jobs_of(sequence, numbers).items()
+        if not only or key in only
+    ]
     runs = runs_of(repeated(listed, ESTIMATORS, repetitions), sequences, [Source(labels)])
     table = run_all(runs, folder, processes=processes).table
     return table.assign(

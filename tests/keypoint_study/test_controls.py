@@ -140,6 +140,25 @@ def test_each_argument_of_masks_is_in_their_record(sequence, small_labels, kind)
         assert kind(**plain | {name: MADE_FROM[name]}).record() != record, name
 
 
+def test_random_keypoints_on_a_mask_are_keypoints_there_drawn_again_alike(sequence, small_labels):
+    asked = Asked(sequence, Source(small_labels), number=20)
+    _, drawn = methods.METHODS["random-on"].choose(asked)
+    _, given = methods.METHODS["masked"].choose(asked)
+    found = detect(sequence.frame(3), THESIS, given[3]).astype(int)
+    rows, columns = np.nonzero(drawn[3])
+    assert 0 < len(rows) <= 20
+    assert {*zip(columns, rows)} < {*map(tuple, found.tolist())}
+    assert np.array_equal(drawn[3], drawn[3]) and not np.array_equal(drawn[3], drawn[2])
+
+
+def test_mirrored_exact_boundaries_are_exact_ones_in_a_mirror(sequence, small_labels):
+    asked = Asked(sequence, Source(small_labels))
+    exact, mirrored = (
+        methods.METHODS[name].choose(asked)[1][3] for name in ("exact-boundaries", "mirrored-exact")
+    )
+    assert np.array_equal(mirrored, exact[:, ::-1]) and mirrored.any()
+
+
 def explored(name, sequence, small_labels, index=3):
     """The frame and keypoints of a method that a study has to name, and its mask."""
     settings, given = methods.METHODS[name].choose(Asked(sequence, Source(small_labels)))

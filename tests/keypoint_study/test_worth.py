@@ -1,13 +1,14 @@
 """What a keypoint is worth: simulated scenes with a known truth, and the rule's verdicts."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
 import pytest
 from street import Street
 
-from keypoint_study import verdicts, worth, worth_runs
+from keypoint_study import verdicts, worth, worth_check, worth_runs
 from thesis_repro import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.odometry import OPENCV, THESIS
@@ -137,6 +138,50 @@ def test_verdicts_need_both_splits_and_both_motions():
         verdicts.MORE,
         verdicts.NO_CLEAR_DIFFERENCE,
     ]
+
+
+def test_no_word_is_said_where_the_check_found_the_measure_wrong(monkeypatch):
+    less = worths(np.random.default_rng(0).normal(-0.7, 0.03, (8, 4)))
+    off = [1.4, 1.6, np.nan]
+    monkeypatch.setattr(worth_runs, "factor_off", lambda *_: off[0])
+    words = []
+    while off:
+        (row,) = worth_runs.typical_worths(less).itertuples()
+        words.append(row.verdict)
+        off.pop(0)
+    assert words == [verdicts.LESS, verdicts.NOT_JUDGED, verdicts.LESS]
+
+
+def test_the_true_worth_of_twice_the_noise_is_a_quarter(monkeypatch):
+    """Simulated steps of 1 m straight ahead, in place of frames."""
+    steps = 40
+    poses = np.tile(np.eye(4), (steps + 1, 1, 1))
+    poses[:, 2, 3] = np.arange(steps + 1)
+    drive = SimpleNamespace(name="00", scales=np.ones(steps + 1), poses=poses)
+
+    def tracked(_, index, chosen, *__):
+        random = np.random.default_rng(index)
+        return independent(random), {("noisy", 200): independent(random, 2 * NOISE)}
+
+    monkeypatch.setattr(worth, "tracked", tracked)
+    (row,) = worth_check.true_worths(drive, {}, 1).itertuples()
+    assert (row.choice, row.number, row.sequence) == ("noisy", 200, "00")
+    assert 0.15 < row.rotation < 0.4 and 0.15 < row.direction < 0.4
+
+
+def test_the_factor_off_is_the_largest_and_that_of_a_ratio_is_a_ratio(monkeypatch):
+    columns = [f"{name}_{kind}" for name in worth.MOTIONS for kind in ("true", *worth.SPLIT)]
+    rows = {
+        ("masks", 400): [0.5, 0.6, 0.4, 1.0, 1.0, 1.0],
+        ("mirrored mask", 400): [0.5, 0.6, 0.4, 1.0, 1.5, 1.0],
+    }
+    table = pd.DataFrame.from_dict(rows, orient="index", columns=columns)
+    table.index = pd.MultiIndex.from_tuples(rows)
+    monkeypatch.setattr(worth_check, "checks", lambda: table)
+    asked = ["masks", "mine: masks", "masks, over mirrored mask", "mirrored mask", "random lines"]
+    found = [worth_check.factor_off(name, 400) for name in asked]
+    assert found == pytest.approx([1.25, 1.25, 1.5, 1.5, np.nan], nan_ok=True)
+    assert np.isnan(worth_check.factor_off("masks", 50))
 
 
 @pytest.mark.parametrize("streets", [8, 11])

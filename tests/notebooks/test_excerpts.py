@@ -28,6 +28,10 @@ def test_a_cut_has_the_frames_poses_and_times_of_their_numbers(tiny_kitti, tmp_p
     assert np.array_equal(part.poses, whole.poses[1:3])
     assert np.array_equal(part.times, whole.times[1:3])
     assert np.array_equal(part.intrinsics, whole.intrinsics)
+    second = excerpts.cut(whole, 0, 3, tmp_path / "cut", "second", every=2)
+    assert [path.name for path in second.frame_paths] == ["000000.png", "000002.png"]
+    assert np.array_equal(second.poses, whole.poses[::2])
+    assert np.array_equal(second.times, whole.times[::2])
     with pytest.raises(InputError, match="00: has 4 frames; 2 to 4 "):
         excerpts.cut(whole, 2, 4, tmp_path / "cut", "part")
 

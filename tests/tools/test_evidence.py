@@ -45,6 +45,9 @@ TABLES = {
     "in_place": lambda: evidence.table_of_places(runs("worth_runs")),
     "left_out": lambda: evidence.table_of_classes(runs("worth_runs")),
     "new_streets": lambda: evidence.table_of_new_streets(runs("worth_runs")),
+    "every_second": lambda: few_keypoints.table_of_few(
+        few_keypoints.ratios_to_all(runs("every_second_runs"))
+    ),
     "few_keypoints": lambda: few_keypoints.table_of_few(
         few_keypoints.ratios_to_all(runs("few_keypoints_runs"))
     ),

@@ -80,6 +80,8 @@ def test_evidence_keeps_what_shows_no_frame(executed, tmp_path, monkeypatch):
         "few_keypoints",
         "worth",
         "worth_runs",
+        "every_second",
+        "every_second_runs",
         "refined_widths",
         "refined_widths_runs",
         "few_keypoints_runs",
