@@ -96,7 +96,7 @@ def typical_worths(table: pd.DataFrame, new: Collection[str] = ()) -> pd.DataFra
             "verdict": _verdict(of_halves, new_disagree(chosen, new), off),
         }
         if of_fit:
-            row["verdict_of_fit"] = _verdict(of_fit)
+            row["verdict_of_fit"] = _verdict(of_fit, off=off)
         for name, logarithms in worths.items():
             numbers = np.exp(ratios.typical_interval(logarithms))
             row |= dict(zip((name, f"{name}_low", f"{name}_high"), numbers, strict=True))

@@ -87,12 +87,6 @@ def of_controls() -> list[str]:
     return [verdict(over=name) for name in comparisons.SEGMENTATION_FREE_CONTROLS]
 
 
-def keypoints_of_controls() -> tuple[float, float]:
-    """Return the least and the greatest mean number of keypoints of these controls."""
-    left = [error("se3", name)["keypoints"] for name in comparisons.SEGMENTATION_FREE_CONTROLS]
-    return min(left), max(left)
-
-
 def by_chance(estimator: str = "thesis") -> pd.Series:
     """Return the highest RMSE over the lowest of shuffled runs with all keypoints, by street."""
     rows = ratios.range_of_shuffles(read_table(f"{REAL}runs"))
@@ -157,11 +151,15 @@ def few(
     """Return the numbers of `ratios.typical_ratio` for so many keypoints, and more.
 
     end: the upper end of the interval of NARROW_LEVEL. failing: on how many streets half of the
-    runs fail. failures: the verdict on more or fewer failures. table: or every_second.
+    runs fail. failures: the verdict on more or fewer failures. word: that on few keypoints, of both
+    errors and estimators. table: or every_second.
     """
-    runs = read_table(f"{REAL}{table}_runs").query("estimator == @estimator")
-    chosen = runs.query("choice == @choice and number == @number")
-    reference = runs.query("choice == @over and number in (0, @number)")
+    runs = read_table(f"{REAL}{table}_runs")
+    sides = [
+        runs.query("choice == @choice and number == @number"),
+        runs.query("choice == @over and number in (0, @number)"),
+    ]
+    chosen, reference = (side[side["estimator"] == estimator] for side in sides)
     of_streets = ratios.ratios_of(chosen, reference, metric)
     failed, of_reference = (rows.set_index("sequence")["failed"] for rows in (chosen, reference))
     return ratios.typical_ratio(of_streets) | {
@@ -169,6 +167,7 @@ def few(
         "end": ratios.narrow_interval(of_streets)[1],
         "failing": streets(equal_number.failing(chosen)),
         "failures": comparisons.failures(failed, of_reference)["failures_verdict"],
+        "word": few_keypoints.verdict_on(*sides),
     }
 
 
@@ -288,7 +287,6 @@ FUNCTIONS = (
     error,
     verdict,
     of_controls,
-    keypoints_of_controls,
     by_chance,
     worth,
     factor_off,

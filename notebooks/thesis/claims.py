@@ -259,7 +259,10 @@ def _of_errors(tables: Tables) -> list[Claim]:
             f"Width {tables.width}: lower on {(fixed < 1).sum()} of {len(fixed)}.",
         )
     )
-    equal = equal_number.over(*_few(tables.few, ("mask", 200), ("random", 200)))
+    equal, places = (
+        equal_number.over(*_few(tables.few, (choice, 200), ("random", 200)))
+        for choice in ("mask", "random-on")
+    )
     shuffles = ratios.range_of_shuffles(tables.runs).query("estimator == 'thesis'")["factor"]
     refined = {
         error: tables.over("masked", error, "refined") for error in comparisons.JUDGING_METRICS
@@ -277,7 +280,8 @@ def _of_errors(tables: Tables) -> list[Claim]:
             f"aligned ATE {_ratio(refined['se3'])}, rotation "
             f"{_ratio(refined['rotation'])}: {equal_number.word(pd.DataFrame(refined))}. At an equal "
             f"number, 200 over 200 random ones, thesis's estimator: {_ratio(equal['se3'])}, "
-            f"{_ratio(equal['rotation'])}: {equal_number.word(equal)}.",
+            f"{_ratio(equal['rotation'])}: {equal_number.word(equal)}; random ones on the mask: "
+            f"{_ratio(places['se3'])}, {_ratio(places['rotation'])}: {equal_number.word(places)}.",
         )
     )
     changes = section_4_2.changes_of_repetition(masked, every, "rmse")
