@@ -253,7 +253,9 @@ def main(camvid, job="", trained=""):
     rows = pd.concat([rows.assign(seed=seed) for seed, rows in histories.items()])
     provenance.write_table(out / "figure_4_01.csv", rows)
     style.save_figure(example(model, *held_out), out, "figure_4_03", f"{note}; CamVid, validation")
-    absent = f"{note}; F1 and IoU: means over {cityscapes.N_CLASSES} outputs, absent classes score 1"
+    absent = (
+        f"{note}; F1 and IoU: means over {cityscapes.N_CLASSES} outputs, absent classes score 1"
+    )
     style.save_table(table_of_training(histories, sizes.patience), out, "training", absent)
     domains = {"CamVid, validation": cityscapes.pairs(folder(camvid), "val")}
     if settings.kitti_semantic:
