@@ -8,7 +8,7 @@ BIN := .venv/bin
 # one of the command line; of the environment, only these are taken.
 SETTINGS := KITTI CITYSCAPES KITTI_SEMANTIC PROFILE IMAGE_SIZE BASE_FILTERS BATCH_SIZE EPOCHS FRAMES WIDTHS REPETITIONS JOBS \
             BUILD FIGURES DASK_SCHEDULER
-MINE := PYTHON GPU CAMVID JOB TRAINED PSEUDO RAW LISTEN RUN
+MINE := PYTHON GPU CAMVID JOB TRAINED PSEUDO RAW LISTEN RUN LAST
 of = $(foreach name,$(2),$(if $(filter $(1),$(origin $(name))),$(name)))
 given := $(filter-out $(MINE) MAKE% -%,$(sort $(call of,command line,$(.VARIABLES))))
 around := $(foreach name,$(call of,environment,$(SETTINGS)),$(if $(THESIS_REPRO_$(name)),,$(name)))
@@ -97,17 +97,24 @@ $(call executed,02 04 05 09): $(call executed,01)
 $(call executed,04): $(call executed,02 03)
 $(call executed,05 09): $(call executed,04)
 $(call executed,06 07 08 09): $(call executed,05)
-$(call executed,07 08): $(call executed,06)
-$(call executed,09): $(call executed,08)
+$(call executed,07 08 09): $(call executed,06)
+# 09 waits for 08, or only for LAST, if this is given: the last file of 08 that it reads. While a notebook is executed, done/
+# has its name with a dot. make starts 08 before `tables`; after a second, 08 has surely begun.
+LAST :=
+$(call executed,09): $(if $(LAST),$(RUN)/code/08_results | tables,$(call executed,08))
+.PHONY: tables
+tables: $(call executed,06)
+	@cd $(RUN)/done && sleep 1; while test -e .08_results && ! test ../$(LAST) -nt .08_results; do sleep 1; done; \
+	test -e .08_results || test -e 08_results
 
 # nbconvert writes under another name: a notebook that exists is done. Its kernel has nothing to do at its end.
 $(RUN)/notebooks/%.ipynb: $(RUN)/code/% $(RUN)/checked
-	@trap 'kill $$!; exit 130' INT TERM HUP; \
+	@trap 'kill $$!; rm -f $(RUN)/done/.$*; exit 130' INT TERM HUP; rm -f $(RUN)/done/$*; : >$(RUN)/done/.$*; \
 	$(BIN)/python -m nbconvert --to notebook --execute --ExecutePreprocessor.kernel_name=python3 \
 	  --ExecutePreprocessor.timeout=-1 --ExecutePreprocessor.shutdown_kernel=immediate \
 	  --output-dir $(@D) --output .$* notebooks/$*.ipynb >$(@:.ipynb=.log) 2>&1 & wait $$! \
 	&& mv $(@D)/.$*.ipynb $@ && (cd $(RUN) && cksum $(^:$(RUN)/%=%) >done/.$* && mv done/.$* done/$*) && echo "$*: done in $$SECONDS s" \
-	|| { echo "$* failed: $$($(call reason,$(@:.ipynb=.log))) ($(@:.ipynb=.log))" >&2; exit 1; }
+	|| { rm -f $(RUN)/done/.$*; echo "$* failed: $$($(call reason,$(@:.ipynb=.log))) ($(@:.ipynb=.log))" >&2; exit 1; }
 # The last line of a log is the error, but not if the kernel died: then it is what the kernel said, or else memory ran out.
 reason = tr -d '\033' <$(1) | sed 's/\[[0-9;]*m//g' | awk '/^F[0-9]|^Fatal Python error|what\(\):/ && !said {said = $$0} NF {last = $$0} \
   END {print last !~ /DeadKernelError/ ? last : said ? said : "its kernel was killed, most likely because memory ran out"}'

@@ -8,7 +8,9 @@ import time
 
 import pytest
 from cells import NOTEBOOKS, executed_by
-from trials import PACKAGES, copy_project, succeed
+from trials import PACKAGES, copy_project, finish, start, succeed
+
+from thesis.settings import ROOT
 
 OUTPUT = '"outputs": [{"output_type": "stream", "name": "stdout", "text": ["shown"]}]'
 ALL = "01 02 03 04 05 06 07 08 09"
@@ -115,3 +117,41 @@ def test_a_clock_that_was_wrong_changes_nothing(project, tmp_path, ahead):
     assert plans == [["09"], ["09"]] and planned() == []
     (run / "done/02_augmentation").unlink()  # of an earlier version
     assert planned() == ["02", "04", "05", "06", "07", "08", "09"]
+
+
+# In place of nbconvert: 08 ends at once or after 09, which it lets begin by writing a table.
+NBCONVERT = """#!/bin/bash
+for word; do case $word in notebooks/0*) name=${word#notebooks/0};; esac; done
+case $name in
+  8*) test $ENDS = early && exit 1
+      sleep 1.1
+      : >run/shuffled_runs.csv
+      for _ in {1..200}; do test -e run/begun || sleep 0.1; done
+      test -e run/begun;;
+  9*) : >run/begun;;
+esac && : >run/notebooks/.0$name
+"""
+
+
+@pytest.mark.parametrize("ends, made", [("late", "08 09"), ("early", "")])
+def test_09_begins_when_08_has_written_its_tables(tmp_path, ends, made):
+    """A table of an earlier run stands there, and results of all notebooks before 08."""
+    (tmp_path / "bin").mkdir()
+    (tmp_path / "bin/python").write_text(NBCONVERT)
+    (tmp_path / "bin/python").chmod(0o755)
+    run = tmp_path / "run"
+    for name in ("notebooks", "code", "done"):
+        (run / name).mkdir(parents=True)
+    names = [name.removesuffix(".ipynb") for name in NOTEBOOKS]
+    files = ["checked", "shuffled_runs.csv", *(f"code/{name}" for name in names)]
+    files += ["drives", *(f"notebooks/{name}.ipynb" for name in names[:7])]
+    files += [f"done/{name}" for name in names]
+    for name in files:
+        (run / name).touch()
+        os.utime(run / name, (1, 1))
+    command = ["make", "-k", "-j2", "-f", ROOT / "Makefile", "notebooks", "RUN=run", "BIN=bin"]
+    command.append("LAST=shuffled_runs.csv")
+    result = finish(start(command, tmp_path, ENDS=ends, MAKEFLAGS=None, MFLAGS=None))
+    left = sorted(path.name[:2] for path in (run / "notebooks").glob("*.ipynb"))
+    assert left == [name[:2] for name in names[:7]] + made.split(), result
+    assert result.returncode == (0 if made else 2)
