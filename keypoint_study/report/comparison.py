@@ -177,7 +177,8 @@ def table_of_ratios(rows: pd.DataFrame) -> pd.DataFrame:
     """Return rows of `comparisons_of` for readers: one row for each pair of methods and estimator.
 
     A ratio is a text, "1.09 (0.98-1.32)", see `texts.short`. The verdict is that of all judging
-    metrics. "failures" is the verdict on the failed runs.
+    metrics. "failures" is the verdict on the failed runs. With too few
+    sequences to tell, neither is there.
     """
     rows = rows[(rows["method"] != "baseline") & rows["metric"].isin(SHOWN)]
     keys = ["estimator", "source", "method", "dilation_width", "reference_source", "reference"]
@@ -209,6 +210,7 @@ def table_of_ratios(rows: pd.DataFrame) -> pd.DataFrame:
     if lines:
         # missing for paths of another system
         table["number"] = table["number"].round().astype("Int64")
+        table = texts.without_untold(table, "verdict", "failures")
     return table
 
 

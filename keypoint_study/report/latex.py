@@ -1,7 +1,4 @@
-"""Tables for a paper: LaTeX that fits a column of 3.5 inches, in letters of 8 points.
-
-They need the package booktabs.
-"""
+"""Tables for a paper: LaTeX that fits one of two columns, in letters of 8 points."""
 
 import re
 from collections.abc import Iterable
@@ -12,13 +9,16 @@ import matplotlib
 import pandas as pd
 from matplotlib.font_manager import get_font
 
-from keypoint_study.report.style import COLUMN_WIDTH, Artefact
+from keypoint_study.report.style import Artefact
 
 SIZE = 8  # points
-COLUMN = 72 * COLUMN_WIDTH  # points
+COLUMN = 229  # points, of a column of article; IEEE's has 252
 NAMES = 85  # points, of the first column at most; longer names are broken
 GAP = 6  # points between columns
 HEADING = 14  # letters of a line of a heading
+NEEDS = f"""% in the preamble: \\usepackage{{booktabs}}
+% for a column of {COLUMN} points or more (article in two columns has {COLUMN}, IEEE 252)
+"""
 SPLIT_BY = ("error", "estimator", "masks")  # columns whose values stand in the caption
 FONT = Path(matplotlib.get_data_path(), "fonts", "ttf", "cmr10.ttf")  # Computer Modern
 SPECIAL = {letter: f"\\{letter}" for letter in "&%$#_{}"}
@@ -54,7 +54,7 @@ def latex_of(artefact: Artefact, table: pd.DataFrame) -> str:
         if number == 1:
             caption = f"{caption}. {artefact.caption}"
         texts.append(_float(rows, caption, f"tab:{artefact.name}-{number}"))
-    return "\n".join(texts)
+    return "\n".join([NEEDS, *texts])
 
 
 def _fitting(rows: pd.DataFrame) -> list[list[str]]:

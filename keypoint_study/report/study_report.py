@@ -238,8 +238,9 @@ def figure_of_sources(study: Study, runs: pd.DataFrame, width: float = PAGE_WIDT
     """Draw the middle frame of the first sequence that has such runs, one row a source.
 
     A row shows the source's label map (or the frame, if there is none), its mask and the kept
-    keypoints, so that a person sees which masks are inverted or lie elsewhere. Own keypoints have
-    no mask. Sources whose runs failed are left out. width: inches.
+    keypoints, so that a person sees which masks are inverted or lie elsewhere. In one column of a
+    paper, sources stand side by side. Own keypoints have no mask. Sources whose runs failed are
+    left out. width: inches.
     """
     drawn = runs[runs["method"].isin(DRAWN)]
     name = drawn["sequence"].iloc[0]
@@ -249,12 +250,20 @@ def figure_of_sources(study: Study, runs: pd.DataFrame, width: float = PAGE_WIDT
     index = len(sequence) // 2
     frame = sequence.frame(index)
     label_maps = []
-    columns, size = 3, 1.5 * width
-    if width <= COLUMN_WIDTH:
-        columns, size = 1, width
-    figure, axes = style.frame_panels(frame, 3 * len(sources) // columns, columns, size)
-    for (first, second, third), source in zip(np.reshape(axes, (-1, 3)), sources, strict=True):
-        style.show_image(first, frame, f"{source.name}: frame {index}")
+    is_wide = width > COLUMN_WIDTH
+    if is_wide:
+        figure, axes = style.frame_panels(frame, len(sources), 3, 1.5 * width)
+        panels = np.reshape(axes, (-1, 3))
+    else:  # up to three sources side by side, so that it takes half a page
+        columns = min(3, len(sources))
+        figure, axes = style.frame_panels(frame, 3 * -(-len(sources) // columns), columns, width)
+        panels = np.reshape(axes, (-1, 3, columns)).swapaxes(1, 2).reshape(-1, 3)
+    for unused in panels[len(sources) :].flat:
+        unused.set_axis_off()
+    for (first, second, third), source in zip(panels, sources):
+        of_first = f"{source.name}: " if is_wide else f"{source.name}\n"
+        of_others = of_first if is_wide else ""
+        style.show_image(first, frame, f"{of_first}frame {index}")
         if source.kind == "keypoints":
             second.set_axis_off()
             points = own_calls(source.folder).detect(frame, THESIS, sequence.visible(index))
@@ -263,12 +272,15 @@ def figure_of_sources(study: Study, runs: pd.DataFrame, width: float = PAGE_WIDT
             if isinstance(masks, LabelMasks):
                 label_maps.append(masks.label_map(index))
                 colors = style.label_colors(label_maps[-1], frame)
-                style.show_image(first, colors, f"{source.name}: label map")
+                style.show_image(first, colors, f"{of_first}label map")
             mask = masks[index]
-            style.show_image(second, mask, f"{source.name}: mask", vmin=0, vmax=255)
+            style.show_image(second, mask, f"{of_others}mask", vmin=0, vmax=255)
+            style.outline(second, mask)
             points = detect(frame, mask=inside(sequence.visible(index), mask))
-        style.show_image(third, frame, f"{source.name}: {len(points)} keypoints")
+        style.show_image(third, frame, f"{of_others}{len(points)} keypoints")
         third.scatter(*points.T, **style.KEYPOINT)
+    for panel in () if is_wide else panels.flat:
+        panel.title.set_fontsize(6)
     if label_maps:
         style.class_legend(figure, *label_maps)
     return Artefact(

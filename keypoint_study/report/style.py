@@ -14,7 +14,7 @@ import matplotlib
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
-from matplotlib.patches import Patch
+from matplotlib.patches import Patch, Rectangle
 from matplotlib.ticker import Locator, LogLocator, MaxNLocator, NullLocator
 from PIL import ExifTags, Image
 
@@ -24,6 +24,7 @@ from thesis_repro.running.files import atomic, write_text
 
 PAGE_WIDTH, COLUMN_WIDTH = 7.2, 3.5  # inches, of figures across a page and in one column of a paper
 NOTE_LETTERS = 22  # of a note, in an inch
+LEGEND_LETTERS = 16  # of a line of a class's names in one of three columns of a narrow figure
 # Okabe and Ito's colours, distinguishable with any colour vision
 BLACK, ORANGE, SKY, GREEN = "#000000", "#e69f00", "#56b4e9", "#009e73"
 BLUE, RED, PINK = "#0072b2", "#d55e00", "#cc79a7"
@@ -154,6 +155,13 @@ def show_image(axes: plt.Axes, image: np.ndarray, title: str, **options: Any) ->
     axes.set_axis_off()
 
 
+def outline(axes: plt.Axes, image: np.ndarray) -> None:
+    """Draw a thin border around a shown image, whose edges may be white."""
+    height, width = image.shape[:2]
+    border = Rectangle((-0.5, -0.5), width, height, fill=False, linewidth=0.5, clip_on=False)
+    axes.add_patch(border)
+
+
 def legend_below(figure: Any, panels: Iterable[plt.Axes], columns: int) -> None:
     """Add a legend below the figure with each label of the panels once."""
     handles: dict[str, Any] = {}
@@ -176,9 +184,17 @@ def class_legend(figure: plt.Figure, *label_maps: np.ndarray, also: Iterable[Any
     for color, labels in names.items():
         handles.append(Patch(color=tuple(np.array(color) / 255), label=", ".join(labels)))
     handles += also
-    rows = -(-len(handles) // 5)
+    columns, lines = 5, 1
+    if figure.get_figwidth() <= COLUMN_WIDTH:
+        columns = 3
+        for handle in handles:
+            handle.set_label(fill(handle.get_label(), LEGEND_LETTERS))
+        lines = max(handle.get_label().count("\n") + 1 for handle in handles)
+    rows = -(-len(handles) // columns) * lines
     figure.set_figheight(figure.get_figheight() + 0.1 + 0.16 * rows)
-    figure.legend(handles=handles, loc="outside lower center", ncols=5, fontsize=7, markerscale=2)
+    figure.legend(
+        handles=handles, loc="outside lower center", ncols=columns, fontsize=7, markerscale=2
+    )
 
 
 def ratio_axis(axis: Any, values: np.ndarray | list[float]) -> None:

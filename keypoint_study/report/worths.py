@@ -16,6 +16,7 @@ from keypoint_study.worth import FIELD, SPLIT
 from keypoint_study.worth_runs import typical_worths
 
 SHOWN = ("direction", "rotation")
+VERDICTS = ("a keypoint tells", "by one fit")  # columns of the table
 REACH = 8  # of the figure's axis, from 1 / REACH to REACH; a street beyond it is drawn at the edge
 DOT: dict[str, Any] = {"color": "#555555", "markersize": 4, "alpha": 0.45, "markeredgewidth": 0}
 
@@ -37,9 +38,8 @@ def table_of_worths(worths: pd.DataFrame, new: Collection[str] = ()) -> Artefact
             for motion in SHOWN:
                 line[f"{motion}, by {split}"] = cell(row, f"{motion}_{split}")
         line["factor off the truth"] = "" if np.isnan(row["off"]) else f"{row['off']:.2f}"
-        line["a keypoint tells"] = row["verdict"]
-        if "verdict_of_fit" in row:
-            line["by one fit"] = row["verdict_of_fit"]
+        verdicts = (row[name] for name in ("verdict", "verdict_of_fit") if name in row)
+        line |= dict(zip(VERDICTS, verdicts))
         lines.append(line)
     return Artefact(
         "worth",
@@ -52,7 +52,7 @@ def table_of_worths(worths: pd.DataFrame, new: Collection[str] = ()) -> Artefact
         "truth is known, for the choices that were checked; where it is too large, the row is not "
         "judged. By one fit: what the covariance of a single fit says, which decides "
         "nothing. worth_runs.csv has every sequence.",
-        pd.DataFrame(lines),
+        texts.without_untold(pd.DataFrame(lines), *VERDICTS),
     )
 
 
@@ -82,7 +82,7 @@ def for_paper(table: pd.DataFrame) -> pd.DataFrame:
     """Return the columns of `table_of_worths` for a paper, without the counts of sequences."""
     numbers = [name for name in table if name.startswith(SHOWN)]
     short = table[numbers].apply(lambda cells: cells.str.partition(",")[0])
-    return table[["choice"]].join(short).assign(**{"a keypoint tells": table["a keypoint tells"]})
+    return table[["choice"]].join(short).join(table.filter(VERDICTS[:1]))
 
 
 def cell(row: dict, name: str) -> str:

@@ -15,6 +15,7 @@ import pytest
 import trials
 
 import thesis_repro as tr
+from keypoint_study import sources
 from thesis_repro.command import cli
 from thesis_repro.command.options import build_parser
 from thesis_repro.data import cityscapes
@@ -32,6 +33,14 @@ def run(command, *words):
 
 PARSER = build_parser(cli.COMMANDS)
 COMMANDS = next(action for action in PARSER._actions if action.dest == "command").choices
+
+
+def test_a_source_given_as_a_link_keeps_the_typed_name(tmp_path):
+    (tmp_path / "run 17").mkdir()
+    (tmp_path / "my-net").symlink_to(tmp_path / "run 17")
+    words = ["study", "--kitti", "kitti", "--output", "out", "--labels", f"{tmp_path}/my-net"]
+    given = PARSER.parse_args([*words, "--labels", f"{tmp_path}/run 17"]).sources
+    assert [each.name for each in sources.named(given, None)] == ["my-net", "run-17"]
 
 
 def test_the_console_script_prints_the_version():

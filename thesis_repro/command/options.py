@@ -2,6 +2,7 @@
 
 import argparse
 import os
+import re
 from collections.abc import Callable, Collection
 from difflib import get_close_matches
 from importlib.metadata import version
@@ -196,7 +197,10 @@ def _name_and_folder(text: str) -> tuple[str | None, Path]:
     """
     name, equals, folder = text.partition("=")
     if not equals or "/" in name or Path(text).is_dir():
-        return None, path(text)
+        folder = path(text)
+        if folder.is_symlink():  # the name that was typed, not that of its target
+            return re.sub(r"[^\w+-]+", "-", folder.name).strip("-") or None, folder
+        return None, folder
     return name, path(folder)
 
 

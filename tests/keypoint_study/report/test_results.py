@@ -1,7 +1,9 @@
 """Figures and tables of chapter 4, the comparison and the findings show the numbers of the runs."""
 
 import re
+import subprocess
 from html import escape
+from shutil import which
 from types import SimpleNamespace
 
 import made_up
@@ -176,11 +178,58 @@ def test_tables_for_a_paper_fit_a_column_and_have_caption_and_label(count):
     ):
         text = latex.latex_of(artefact, rows)
         measured = widths_in(text)
-        assert measured and max(measured) <= 3.5 * 72
+        assert measured and max(measured) <= latex.COLUMN
         for command in ("caption", "label", "end{tabular}", "fontsize{8}"):
             assert text.count(f"\\{command}") == len(measured)
         assert "a_100" not in text
         assert len(set(re.findall(r"\\label{.*?}", text))) == len(measured)
+
+
+def test_the_classes_of_a_narrow_figure_are_named_inside_it():
+    every = np.arange(35, dtype=np.uint8)[None]
+    frame = np.zeros((40, 120), np.uint8)
+    figure, _ = style.frame_panels(frame, width=style.COLUMN_WIDTH)
+    style.class_legend(figure, every)
+    figure.draw_without_rendering()
+    (legend,) = figure.legends
+    box = legend.get_window_extent().transformed(figure.transFigure.inverted())
+    assert 0 <= box.x0 < box.x1 <= 1 and 0 <= box.y0 < box.y1 <= 1
+
+
+def test_what_cannot_be_told_has_no_column():
+    table = comparisons.comparisons_of(runs_of(ELEVEN[:2], halved, noise=0.2))
+    few = comparison.table_of_ratios(comparison.all_of(table))
+    assert verdicts.TOO_FEW not in few.to_string() and set(few["sequences"]) == {2}
+
+
+DOCUMENT = r"""\documentclass[twocolumn]{article}
+\usepackage[T1]{fontenc}
+\usepackage{booktabs}
+\begin{document}
+\typeout{column \the\columnwidth}
+%s
+\end{document}
+"""
+
+
+@pytest.mark.skipif(not which("pdflatex"), reason="needs LaTeX")
+def test_tables_for_a_paper_are_set_without_an_overfull_box(tmp_path):
+    runs = runs_of(ELEVEN, halved, noise=0.2, sources=("a_100%{net}", "hand"))
+    table = comparisons.comparisons_of(runs)
+    shown = comparison.table_of_errors(table, runs)
+    widths = comparison.table_of_widths(runs)
+    ratios_of = comparison.long_table_of_ratios(table)
+    pairs = (shown, shown.content), (widths, widths.content)
+    pairs += ((ratios_of, comparison.ratios_for_paper(table)),)
+    text = DOCUMENT % "\\clearpage\n".join(latex.latex_of(*pair) for pair in pairs)
+    (tmp_path / "paper.tex").write_text(text)
+    command = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "paper.tex"]
+    told = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, errors="replace")
+    assert told.returncode == 0, told.stdout[-2000:]
+    assert float(re.search(r"column ([\d.]+)pt", told.stdout)[1]) == pytest.approx(
+        latex.COLUMN, 0.01
+    )
+    assert re.findall(r"Overfull .*", (tmp_path / "paper.log").read_text(errors="replace")) == []
 
 
 def test_ratios_in_the_tables_equal_the_comparison():
