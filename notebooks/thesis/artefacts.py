@@ -8,8 +8,8 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 import pandas as pd
+from numba.core import event as numba_events
 
-import street_world
 from keypoint_study.report import style
 from thesis.settings import Settings, read_settings
 from thesis_repro.data import kitti
@@ -21,10 +21,25 @@ IN_PACKAGE = "the model in the package"
 NETWORK_IN_PACKAGE = "11a5270f8fd2"  # its digest in records of label maps, without TensorFlow
 
 
+class _Waiting(numba_events.Listener):
+    """Says in a cell, once a notebook, that it compiles: what is compiled is then on disk."""
+
+    said = False
+
+    def on_start(self, event: Any) -> None:
+        if not self.said:
+            self.said = True
+            print("compiling, once: up to a minute", flush=True)
+
+    def on_end(self, event: Any) -> None:
+        pass
+
+
 def begin() -> Settings:
     """Begin a notebook: set the style of the figures, and return the settings of the run."""
     style.use()
     program.keep_freed_memory()
+    numba_events.install_listener("numba:compile", _Waiting())
     gc.freeze()  # what was imported is no garbage; not to look at it again spares time
     settings = read_settings()
     print(settings)
@@ -39,19 +54,21 @@ def needed(name: str, notebook: str) -> Path:
     return files.needed(read_settings().build / name, notebook)
 
 
-def model_of_run() -> Any:
-    """Load the model that notebook 5 uses: the trained one, or that in the package if none is.
+def is_trained() -> bool:
+    """Return whether notebook 4 has trained a model of this run."""
+    settings = read_settings()
+    return not settings.uses_shipped_model and (settings.build / "model/model.keras").is_file()
 
-    Raises InputError with the name of notebook 4 if it was not run.
-    """
+
+def model_of_run() -> Any:
+    """Load the model that notebook 5 uses: the trained one, or that in the package if none is."""
     from thesis_repro.segmentation import quietly
 
     with quietly():  # what TensorFlow prints when it starts is no error
         from thesis_repro.segmentation import prediction, training
-    settings = read_settings()
-    if settings.uses_shipped_model:
+    if not is_trained():
         return prediction.load_shipped()
-    return training.load_model(needed("model/model.keras", "04_training"))
+    return training.load_model(read_settings().build / "model/model.keras")
 
 
 def used_model() -> Any:
@@ -63,7 +80,7 @@ def used_model() -> Any:
 
     with quietly():
         from thesis_repro.segmentation import prediction, training
-    network = _network_of_label_maps()
+    network = network_of_label_maps()
     if network == NETWORK_IN_PACKAGE:
         return prediction.load_shipped()
     model = model_of_run()
@@ -75,35 +92,6 @@ def used_model() -> Any:
     return model
 
 
-def ensure_label_maps() -> None:
-    """Do what notebook 5 does, with the model in the package, unless it was run: 6 comes first.
-
-    The embedded world is rendered if it is used. Notebook 5 replaces the label maps.
-    """
-    settings = read_settings()
-    if _network_of_label_maps() not in (None, NETWORK_IN_PACKAGE):
-        return
-    if settings.kitti_is_embedded:
-        world = settings.sizes.world | {"seed": settings.seed, "jobs": settings.jobs}
-        street_world.write(settings.world, **world, only="kitti", replace=True)
-    missing = {}
-    for name in kitti.sequences(settings.kitti):
-        paths = kitti.Sequence(settings.kitti, name).subset(settings.sizes.frames).frame_paths
-        folder = settings.build / "labels" / name
-        if not all((folder / f"{path.stem}.png").is_file() for path in paths):
-            missing[folder] = paths
-    if not missing:
-        return
-    from thesis_repro.segmentation import quietly
-
-    with quietly():
-        from thesis_repro.segmentation import prediction
-    model = prediction.load_shipped()
-    for folder, paths in missing.items():
-        prediction.write_label_maps(model, paths, folder)
-    write_text(LABELS_BY, IN_PACKAGE)
-
-
 def data_note(whose: str = "") -> str:
     """Return what figures and tables say about the data of the run, and of its label maps.
 
@@ -112,12 +100,12 @@ def data_note(whose: str = "") -> str:
     settings = read_settings()
     if settings.uses_shipped_model:
         return settings.data_note
-    if whose == IN_PACKAGE or (not whose and _network_of_label_maps() == NETWORK_IN_PACKAGE):
+    if whose == IN_PACKAGE or (not whose and network_of_label_maps() == NETWORK_IN_PACKAGE):
         return f"{settings.data_note}; label maps: by {IN_PACKAGE}"
     return settings.data_note
 
 
-def _network_of_label_maps() -> str | None:
+def network_of_label_maps() -> str | None:
     """Return the digest of the network that made the label maps of the run, or None.
 
     Their record tells. Raises InputError if two networks did, because a notebook was stopped.

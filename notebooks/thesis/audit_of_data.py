@@ -1,6 +1,6 @@
 """Measure the rows of the audit that notebook 09 does not show live.
 
-They need the files of notebooks 01 to 08 in the folder of the run.
+Rows of notebooks that were not run have no numbers.
 """
 
 from pathlib import Path
@@ -14,7 +14,7 @@ from cv2 import INTER_NEAREST, resize
 from keypoint_study.jobs import CONTROL_WIDTH
 from keypoint_study.methods import METHODS, Asked
 from keypoint_study.sources import Source
-from thesis import ablations, artefacts, audit_of_tables, domain_gap, timing
+from thesis import ablations, artefacts, audit_of_tables, domain_gap, earlier, timing
 from thesis.audit import measurement, ratio
 from thesis.audit_of_tables import TIME_OF_NARROW, TIME_TOGETHER, TIME_TYPICAL, WIDTHS
 from thesis.settings import Settings
@@ -40,7 +40,7 @@ def measurements_of_run(
     drives: the sequences of the ablations. repetitions: of each ablation. pairs: of frames of each
     sequence whose keypoints and boundaries are measured one by one. Writes ablations.csv.
     """
-    labels = artefacts.needed("labels", "05_prediction")
+    labels = earlier.label_maps()
     ablated = ablations.run_ablations(
         drives, labels, settings.build / "audit", repetitions, settings.jobs
     )
@@ -52,7 +52,7 @@ def measurements_of_run(
         *audit_of_tables.of_tracks(pd.concat(tracks, ignore_index=True)),
         *audit_of_tables.of_shares(right_pixels(settings, drives, labels)),
         *of_earlier_notebooks(settings, len(drives)),
-        *([] if settings.uses_shipped_model else of_training(settings)),
+        *(of_training(settings) if artefacts.is_trained() else []),
     ]
 
 
@@ -124,13 +124,18 @@ def right_shares(predicted: np.ndarray, exact: np.ndarray, frame: np.ndarray) ->
 
 
 def of_earlier_notebooks(settings: Settings, count: int) -> list[dict[str, Any]]:
-    """Return the rows of the tables that notebooks 05, 06 and 08 wrote. count: of the sequences."""
-    runs, shuffled = (
-        pd.read_csv(artefacts.needed(f"{name}.csv", "08_results"), dtype={"sequence": str})
-        for name in ("runs", "shuffled_runs")
-    )
-    measurements = audit_of_tables.of_study(runs, shuffled)
-    found_again = pd.read_csv(artefacts.needed("found_again.csv", "06_keypoint_masks"))
+    """Return the rows of the tables that notebooks 05, 06 and 08 wrote. count: of the sequences.
+
+    Says which rows have no numbers because a notebook was not run.
+    """
+    measurements: list[dict[str, Any]] = []
+    if (settings.build / "runs.csv").is_file():
+        measurements += audit_of_tables.of_study(*earlier.results()[:2])
+        measurements += of_times(settings)
+    else:
+        print("notebook 8 was not run, so rows that need its runs have no number")
+    path = settings.build / "found_again.csv"
+    found_again = pd.read_csv(path) if path.is_file() else pd.DataFrame()
     text = "keypoints not found again in the next frame"
     for _, kind, _, share in found_again.itertuples():
         measurements.append(measurement("73", text, share, "%", metric=kind))
@@ -138,7 +143,7 @@ def of_earlier_notebooks(settings: Settings, count: int) -> list[dict[str, Any]]
     for row in quality[quality["domain"] == domain_gap.FRAMES].itertuples() if len(quality) else ():
         recall, frames = 100 * row.sky_recall, round(row.images / count)
         measurements.append(measurement("46", "recall of the sky", recall, "%", frames=frames))
-    return measurements + of_times(settings)
+    return measurements
 
 
 def of_times(settings: Settings) -> list[dict[str, Any]]:
@@ -171,7 +176,8 @@ def of_times(settings: Settings) -> list[dict[str, Any]]:
 
 def of_training(settings: Settings) -> list[dict[str, Any]]:
     """Return rows 7 and 44, from the validation images and the network of notebook 04."""
-    data = artefacts.needed("data", "01_load_images_and_labels")
+    earlier.images()
+    data = settings.build / "data"
     model = artefacts.model_of_run()
     model.compile(loss=training.total_loss())
     images, label_maps = (np.load(data / f"validation_{x}.npy")[:16] for x in ("images", "labels"))

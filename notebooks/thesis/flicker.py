@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 
 from thesis_repro import masks
 from thesis_repro.odometry import THESIS
@@ -123,3 +124,20 @@ def found_again(
     again = followed & ~_far(tracked, after)
     new = _far(after, tracked[again])
     return before[again], tracked[again], before[~again], after[new]
+
+
+def table_of_lost(
+    frames: Sequence[np.ndarray], masks_of: dict[str, Sequence[np.ndarray | None]]
+) -> pd.DataFrame:
+    """Return the share of keypoints of consecutive frames that the next frame does not find again.
+
+    masks_of: {text: a mask for each frame, or None}; one row for each.
+    """
+    rows = []
+    for text, chosen in masks_of.items():
+        pairs = zip(frames, frames[1:], chosen, chosen[1:])
+        again, _, lost, _ = zip(*(found_again(*pair) for pair in pairs))
+        missing, detected = len(np.concatenate(lost)), len(np.concatenate([*again, *lost]))
+        share = round(100 * missing / max(detected, 1), 1)
+        rows.append({"keypoints": text, "detected": detected, "not found again (%)": share})
+    return pd.DataFrame(rows)

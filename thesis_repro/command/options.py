@@ -197,10 +197,10 @@ def _name_and_folder(text: str) -> tuple[str | None, Path]:
     """
     name, equals, folder = text.partition("=")
     if not equals or "/" in name or Path(text).is_dir():
-        folder = path(text)
-        if folder.is_symlink():  # the name that was typed, not that of its target
-            return re.sub(r"[^\w+-]+", "-", folder.name).strip("-") or None, folder
-        return None, folder
+        whole = path(text)
+        if whole.is_symlink():  # the name that was typed, not that of its target
+            return re.sub(r"[^\w+-]+", "-", whole.name).strip("-") or None, whole
+        return None, whole
     return name, path(folder)
 
 
