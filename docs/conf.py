@@ -2,6 +2,7 @@
 
 import json
 import re
+from collections import defaultdict
 from pathlib import Path
 
 from docutils import nodes
@@ -9,6 +10,19 @@ from docutils.utils.math.latex2mathml import tex2mathml
 
 ROOT = Path(__file__).resolve().parents[1]
 CAPTIONS = ROOT / "notebooks/thesis/captions.json"
+CLAIMS = ROOT / "figures/kitti_excerpts/claims.md"
+BOOK = ""  # where the book is hosted, once it is: README then links it
+CARDS = {  # a picture of each lesson on the first page
+    "01_load_images_and_labels": "figures/figure_3_05.svg",
+    "02_augmentation": "figures/figure_3_01.webp",
+    "03_unet": "figures/figure_2_07.svg",
+    "04_training": "figures/figure_4_01.svg",
+    "05_prediction": "figures/figure_4_03.webp",
+    "06_keypoint_masks": "figures/figure_3_06.webp",
+    "07_visual_odometry": "figures/figure_2_09.webp",
+    "08_results": "figures/comparison.svg",
+    "09_audit": "figures/figure_2_10.svg",
+}
 PACKAGES = ("thesis_repro", "keypoint_study", "opencv_exact", "street_world")
 
 project = html_title = "Keypoint masks for visual odometry"
@@ -34,6 +48,9 @@ html_show_copyright = False
 author = "the contributors of thesis-repro"
 html_last_updated_fmt = None
 
+PICTURE = re.compile(r'(<img\b[^>]*?\bsrc="([^"]+)"[^>]*>)')
+SCROLLS = re.compile(r'<div class="(?:pst-scrollable-table-container|output text_html|equation)"')
+
 captions = json.loads(CAPTIONS.read_text(encoding="utf-8"))
 
 
@@ -44,19 +61,60 @@ def in_book(app, docname, source):
         for path in (CAPTIONS, __file__):
             app.env.note_dependency(path)
         source[0] = lesson(name, json.loads(source[0]))
-    elif docname == "index" and not Path(app.srcdir, "results").is_dir():
-        source[0] = source[0].replace("/results/README\n", "")  # the default run's is the gallery
-    elif folder and not source[0].startswith("#"):  # a table or findings without a title
+    elif docname == "index":
+        for path in (CLAIMS, CAPTIONS, __file__):
+            app.env.note_dependency(path)
+        source[0] = source[0].replace("<!-- claims -->", claims_in_short())
+        source[0] = source[0].replace("<!-- cards -->", cards())
+        if not Path(app.srcdir, "results").is_dir():  # the default run's is the gallery
+            source[0] = source[0].replace("/results/README\n", "")
+    elif folder and not re.match(r"(<!--.*?-->\s*)?#", source[0], re.DOTALL):  # without a title
         title = name.replace("_", " ").capitalize()
         source[0] = f"---\norphan: true\n---\n# {title}\n\n{source[0]}"
 
 
+def claims_in_short():
+    """Return the claims of the thesis as a small table: how many have each word, and which."""
+    of_word = defaultdict(list)
+    for line in CLAIMS.read_text(encoding="utf-8").splitlines():
+        cells = [cell.strip() for cell in line.split("|")]
+        if len(cells) == 7 and cells[1] not in ("where", ":---"):
+            of_word[cells[4]].append(re.sub(r" \(.*\)$", "", cells[2]))
+    rows = ["| claims | what became of them | such as |", "| ---: | :--- | :--- |"]
+    for word, said in sorted(of_word.items(), key=lambda each: len(each[1])):
+        rows.append(f"| {len(said)} | {word} | {' '.join(said[:3])} |")
+    return "\n".join(rows)
+
+
+def cards():
+    """Return a card for each lesson: its picture, its title, and what it does."""
+    first = json.loads((ROOT / "notebooks/01_load_images_and_labels.ipynb").read_text())
+    text = "".join(first["cells"][0]["source"])
+    does = dict(re.findall(r"(?m)^\| `(\w+)` \| ([^|]*?) \|", text))
+    parts = ['<div class="cards">']
+    for name, picture in CARDS.items():
+        notebook = json.loads((ROOT / f"notebooks/{name}.ipynb").read_text())
+        title = "".join(notebook["cells"][0]["source"]).splitlines()[0].removeprefix("# ")
+        seen = captions["seen"][Path(picture).stem]
+        link = f"/notebooks/{name}.ipynb"
+        parts.append(
+            f'<div class="card">\n\n[![{seen}](/{picture})]({link})\n\n**[{title}]({link})** '
+            f"{does[name]}.\n\n</div>"
+        )
+    return "\n\n".join([*parts, "</div>"])
+
+
 def lesson(name, notebook):
-    """Return a notebook with a link to the lab and alternative texts, as JSON."""
-    lab = f"http://localhost:8888/lab/tree/{name}.ipynb"
+    """Return a notebook with its name in the lab and alternative texts, as JSON."""
     first = notebook["cells"][0]
-    first["source"] = "".join(first["source"]) + f"\n\n[Open in the lab]({lab}), after `make lab`."
+    first["source"] = "".join(first["source"]) + f"\n\n**In the lab:** `make lab`, `{name}.ipynb`."
     for cell in notebook["cells"]:
+        for output in cell.get("outputs", ()):
+            written = output.get("data", {}).get("text/markdown")
+            if written:  # what a notebook shows stands beside the figures, the page does not
+                output["data"]["text/markdown"] = re.sub(
+                    r"\]\(([\w-]+\.(?:csv|md|svg|webp))\)", r"](/figures/\1)", "".join(written)
+                )
         keys = (cell["id"], *re.findall(r'"(\w+)"', "".join(cell["source"])))
         cell["metadata"]["seen"] = [
             captions["seen"][key] for key in keys if key in captions["seen"]
@@ -77,6 +135,22 @@ def say_what_is_seen(app, doctree):
                 picture["alt"] = text
 
 
+def reach_by_all(app, pagename, templatename, context, doctree):
+    """Let pictures link their files, the keyboard reach what scrolls, and lists have names."""
+    made = context.get("generate_toctree_html")
+    if made is not None:
+        context["generate_toctree_html"] = lambda *given, **named: str(
+            made(*given, **named)
+        ).replace("<summary>", '<summary aria-label="pages below this one">')
+    if "body" not in context or pagename.startswith("autoapi"):
+        return
+    body = SCROLLS.sub(r'\g<0> tabindex="0"', context["body"])
+    body = re.sub(r"<th(?: class=\"head\")?>(?:<p></p>)?</th>", "<td></td>", body)  # heads nothing
+    parts = re.split(r"(<a\b.*?</a>)", body, flags=re.DOTALL)  # what is linked stays
+    parts[::2] = [PICTURE.sub(r'<a href="\2">\1</a>', part) for part in parts[::2]]
+    context["body"] = "".join(parts)
+
+
 def line_of_mathml(translator, node):
     """Write an equation that stands inside a line."""
     translator.body.append(tex2mathml(node.astext()))
@@ -94,4 +168,5 @@ def setup(app):
     """Tell Sphinx about the functions above."""
     app.connect("source-read", in_book)
     app.connect("doctree-read", say_what_is_seen)
+    app.connect("html-page-context", reach_by_all, priority=900)  # after those of the theme
     app.add_html_math_renderer("mathml", (line_of_mathml, None), (block_of_mathml, None))

@@ -188,7 +188,8 @@ def write(
             for picture in pictures
             if not (picture.image_path.is_file() and picture.label_path.is_file())
         ]
-        _write_missing(missing, jobs)
+        if missing:
+            _write_missing(missing, jobs)
         if only != "cityscapes":
             for name in sequences:
                 if not (out / "kitti" / "poses" / f"{name}.txt").is_file():  # written last

@@ -280,6 +280,12 @@ def render(template: str) -> str:
     return texts.render(template, **named, errors=ERRORS)
 
 
+def book() -> str:
+    """Return where README finds the book: its address in docs/conf.py, or else the gallery."""
+    (address,) = re.findall(r'(?m)^BOOK = "(.*?)"', (ROOT / "docs/conf.py").read_text())
+    return address or "figures/README.md"
+
+
 # that templates call
 FUNCTIONS = (
     read_table,
@@ -298,6 +304,7 @@ FUNCTIONS = (
     of_rendered,
     claim,
     all_claims,
+    book,
     equal,
     worth_range,
     day_share,
