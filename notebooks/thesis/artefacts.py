@@ -3,6 +3,7 @@
 import gc
 from base64 import b64encode
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -29,17 +30,23 @@ class _Waiting(numba_events.Listener):
     def on_start(self, event: Any) -> None:
         if not self.said:
             self.said = True
-            print("compiling, once: up to a minute", flush=True)
+            print("compiling, which is needed once and takes up to a minute", flush=True)
 
     def on_end(self, event: Any) -> None:
         pass
+
+
+@cache
+def say_that_it_compiles() -> None:
+    """Let whatever Numba compiles from now on be told to who waits for it."""
+    numba_events.register("numba:compile", _Waiting())
 
 
 def begin() -> Settings:
     """Begin a notebook: set the style of the figures, and return the settings of the run."""
     style.use()
     program.keep_freed_memory()
-    numba_events.install_listener("numba:compile", _Waiting())
+    say_that_it_compiles()
     gc.freeze()  # what was imported is no garbage; not to look at it again spares time
     settings = read_settings()
     print(settings)

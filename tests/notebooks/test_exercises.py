@@ -13,6 +13,7 @@ from io import StringIO
 
 import cv2
 import matplotlib.pyplot as plt
+import numba
 import numpy as np
 import pandas as pd
 import pytest
@@ -371,6 +372,14 @@ def training_weights(path):
     from thesis_repro.segmentation import training
 
     return training.weights_digest(training.load_model(path))
+
+
+def test_a_cell_that_compiles_says_so_once(capsys):
+    artefacts.say_that_it_compiles.cache_clear()
+    artefacts.say_that_it_compiles()
+    for number in (1, 2):
+        numba.njit(lambda x, number=number: x + number)(number)
+    assert capsys.readouterr().out.count("compiling") == 1
 
 
 def test_notebook_9_says_whose_runs_it_reads(build, small_model):
