@@ -1,5 +1,7 @@
 """Visual odometry with one camera, and keypoint masks from segmentation: a thesis, reproduced.
 
+A few lines of use::
+
     import thesis_repro as tr
 
     drive = tr.Sequence("world/kitti", 0)  # tr.Sequence.from_arrays: frames in memory

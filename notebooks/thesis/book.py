@@ -22,6 +22,8 @@ PARTS = (
     "docs/*",
     "figures/*.*",
     f"figures/{gallery.REAL}/**/*",
+    "figures/camvid/*",
+    "tools/*.py",
     "tests/reference/*.md",
     "opencv_exact/*.md",
     "thesis_repro/**/*.md",
