@@ -9,6 +9,7 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 import pandas as pd
+from IPython import get_ipython
 from numba.core import event as numba_events
 
 from keypoint_study.report import style
@@ -23,14 +24,15 @@ NETWORK_IN_PACKAGE = "11a5270f8fd2"  # its digest in records of label maps, with
 
 
 class _Waiting(numba_events.Listener):
-    """Says in a cell, once a notebook, that it compiles: what is compiled is then on disk."""
+    """Says once in a cell that it compiles: what is compiled is then on disk."""
 
-    said = False
+    said_in: int | None = None  # the number of the cell
 
     def on_start(self, event: Any) -> None:
-        if not self.said:
-            self.said = True
-            print("compiling, which is needed once and takes up to a minute", flush=True)
+        cell = getattr(get_ipython(), "execution_count", 0)
+        if cell != self.said_in:
+            self.said_in = cell
+            print("compiling, needed once: a minute, or more on a busy machine", flush=True)
 
     def on_end(self, event: Any) -> None:
         pass

@@ -129,7 +129,7 @@ def of_earlier_notebooks(settings: Settings, count: int) -> list[dict[str, Any]]
     Says which rows have no numbers because a notebook was not run.
     """
     measurements: list[dict[str, Any]] = []
-    if (settings.build / "runs.csv").is_file():
+    if (settings.build / "shuffled_runs.csv").is_file():
         measurements += audit_of_tables.of_study(*earlier.results()[:2])
         measurements += of_times(settings)
     else:

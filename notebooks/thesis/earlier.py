@@ -144,7 +144,7 @@ def results() -> tuple[pd.DataFrame, pd.DataFrame, str]:
     """
     build = read_settings().build
     folder, whose = EVIDENCE, "the real streets in git, because notebook 8 was not run"
-    if (build / "runs.csv").is_file():
+    if (build / "shuffled_runs.csv").is_file():
         folder, whose = build, f"this run, label maps: by {_network_of_runs(build)}"
     tables = [
         pd.read_csv(folder / name, dtype={"sequence": str}, low_memory=False)
