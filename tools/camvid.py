@@ -207,7 +207,7 @@ def streets(settings, labels, out, note):
     study = Study(
         settings.kitti,
         names,
-        tuple(Source(folder) for folder in labels),
+        (Source(labels),),
         (CONTROL_WIDTH,),
         estimators=("refined", "thesis"),
         repetitions=settings.sizes.repetitions,
@@ -264,11 +264,11 @@ def main(camvid, job="", trained=""):
     scores = domain_gap.scores_of_models(by_seed, domains)
     style.save_table(domain_gap.table_of_scores(scores), out, "scores", note)
     if not settings.kitti_is_embedded:
-        labels = [root / "labels" / f"CamVid, {name}" for name in by_seed]
-        for model, label_folder in zip(by_seed.values(), labels, strict=True):
-            for name in kitti.sequences(settings.kitti):
-                paths = kitti.Sequence(settings.kitti, name).frame_paths
-                prediction.write_label_maps(model, paths, label_folder / name)
+        name = next(iter(by_seed))  # label maps take minutes, so only the first network makes them
+        labels = root / "labels" / f"CamVid, {name}"
+        for street in kitti.sequences(settings.kitti):
+            paths = kitti.Sequence(settings.kitti, street).frame_paths
+            prediction.write_label_maps(model, paths, labels / street)
         streets(settings, labels, out, note)
     program.summary(f"curves, scores and an example: {out}")
 
