@@ -81,7 +81,7 @@ def test_a_cluster_gives_the_same_bits_although_a_worker_is_killed(
     small_world, small_labels, two_workers, scheduler, tmp_path
 ):
     opened = [Sequence(small_world / "kitti", name) for name in ("00", "01")]
-    jobs = first_jobs(opened, {"thesis": (5, 15)}, repetitions=2)
+    jobs = first_jobs(opened, {"thesis": (5,)}, repetitions=2)
     runs = runs_of(jobs, opened, [Source(small_labels)])
     here = runner.run_all(runs, tmp_path / "here")
     there = tmp_path / "there"

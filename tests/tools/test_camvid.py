@@ -26,6 +26,7 @@ def tiny(tiny_cityscapes, tmp_path, monkeypatch):
     monkeypatch.setattr(camvid.tf.config.threading, "set_inter_op_parallelism_threads", int)
 
 
+@pytest.mark.torture
 def test_a_longer_training_goes_on_and_writes_curves_and_scores(
     tiny_cityscapes, tmp_path, monkeypatch
 ):
