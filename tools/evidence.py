@@ -95,7 +95,7 @@ def write(settings, folder):
             jobs.CONTROL_WIDTH,
             settings.build / "worth",
             (worth_runs.DECIDING, 0, 200, 100),
-            settings.jobs,
+            processes=settings.jobs,
             named=tuple(EXPLORED),
         ),
         "refined estimator, every width": lambda: runs_of_widths(settings, sequences, labels),
