@@ -132,7 +132,7 @@ def rendered_images(size: int) -> tuple[np.ndarray, np.ndarray]:
         "validation_images": 4,
         "jobs": settings.jobs,
     }
-    street_world.write(settings.build / "rendered", **world, only="cityscapes")
+    street_world.write(settings.build / "rendered", **world, only="cityscapes", replace=True)
     pairs = cityscapes.pairs(settings.build / "rendered/cityscapes", "val")
     return cityscapes.load(pairs, size)
 
