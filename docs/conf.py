@@ -76,7 +76,8 @@ def in_book(app, docname, source):
 def claims_in_short():
     """Return the claims of the thesis as a small table: how many have each word, and which."""
     of_word = defaultdict(list)
-    for line in CLAIMS.read_text(encoding="utf-8").splitlines():
+    lines = CLAIMS.read_text(encoding="utf-8").splitlines() if CLAIMS.is_file() else []
+    for line in lines:
         cells = [cell.strip() for cell in line.split("|")]
         if len(cells) == 7 and cells[1] not in ("where", ":---"):
             of_word[cells[4]].append(re.sub(r" \(.*\)$", "", cells[2]))
@@ -99,7 +100,7 @@ def cards():
         link = f"/notebooks/{name}.ipynb"
         parts.append(
             f'<div class="card">\n\n[![{seen}](/{picture})]({link})\n\n**[{title}]({link})** '
-            f"{does[name]}.\n\n</div>"
+            f"{does.get(name, '')}.\n\n</div>"
         )
     return "\n\n".join([*parts, "</div>"])
 

@@ -55,7 +55,7 @@ def record(root, run):
         # a notebook counts all modules that its own import
         ([("thesis_repro/masks/filter.py", "cv2.Canny(", "cv2.Canny(*")], ALL),
         ([("street_world/raster.py", "- 0.5", "- 0.25")], ALL),
-        ([("keypoint_study/report/worths.py", "import pandas", "import  pandas")], "08 09"),
+        ([("keypoint_study/report/comparison.py", "import pandas", "import  pandas")], "08 09"),
         ([("notebooks/thesis/audit.json", "{", " {")], "09"),
         (
             [
