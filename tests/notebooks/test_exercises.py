@@ -265,6 +265,7 @@ def test_exercise_03_3(build):
         run("03", NETWORK, ("SIZE = settings.sizes.image_size", "SIZE = 100"))
 
 
+@pytest.mark.torture
 def test_exercise_04_2(networks):
     same = run("04", LOSSES, (CROSS_ENTROPY, "other_loss = total_loss"))
     first, second = (same[name].history for name in ("history1", "history2"))
