@@ -109,7 +109,7 @@ def test_rendered_and_made_up_frames_give_opencvs_bits():
 
 @pytest.mark.real
 @pytest.mark.torture
-def test_300000_points_of_real_and_made_up_frames_give_opencvs_bits():
+def test_300000_points_of_real_and_made_up_frames_give_opencvs_bits(kitti_real):
     random, totals = np.random.default_rng(1), np.zeros(3, int)
     for name in ("00", "01", "04", "06", "07"):
         paths = sorted((SHARED / name / "image_0").glob("*.png"))[:9]
