@@ -26,7 +26,7 @@ NEIGHBOURHOOD = 40  # pixels
 
 @dataclass(frozen=True, eq=False)
 class MadeMasks:
-    """Masks that a function makes: masks[i] = make(given, values, i) for frame i, values in a row.
+    """Masks that a function makes: that of frame i is ``make(given, *values, i)``.
 
     given: other masks, or a sequence. values: what else the function takes.
     """
