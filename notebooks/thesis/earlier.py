@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 
 import street_world
+from keypoint_study.jobs import CONTROL_WIDTH
 from thesis import artefacts
 from thesis.settings import ROOT, read_settings
 from thesis_repro.data import cityscapes, kitti
@@ -63,7 +64,7 @@ def label_maps() -> Path:
 def masks_json() -> dict[str, Any]:
     """Return the settings of the masks of notebook 6; without it, the thesis's."""
     path = read_settings().build / "masks.json"
-    return json.loads(path.read_text()) if path.is_file() else {"width": 10}
+    return json.loads(path.read_text()) if path.is_file() else {"width": CONTROL_WIDTH}
 
 
 def images() -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 
 import thesis_repro as tr
+from keypoint_study.jobs import CONTROL_WIDTH
 from keypoint_study.report import style
 from thesis import frames
 from thesis_repro import masks
@@ -62,11 +63,11 @@ def parts(drive: kitti.Sequence, labels: Path) -> dict[str, np.ndarray]:
 
     With true label maps, a mask is divided into what lies near a true boundary and what does not.
     """
-    predicted = np.array(tr.LabelMasks(labels, drive, 10))
+    predicted = np.array(tr.LabelMasks(labels, drive, CONTROL_WIDTH))
     kinds = {"all keypoints": np.full_like(predicted, 255), "predicted label maps": predicted}
     exact = drive.folder / kitti.TRUE_LABELS
     if exact.is_dir():
-        true = np.array(tr.LabelMasks(exact, drive, 10))
+        true = np.array(tr.LabelMasks(exact, drive, CONTROL_WIDTH))
         kinds["of these, near true boundaries"] = np.where(true > 0, predicted, 0)
         kinds["of these, invented"] = np.where(true > 0, 0, predicted)
         kinds |= {"true label maps": true, "true and predicted ones": np.maximum(predicted, true)}
