@@ -27,6 +27,7 @@ def worths_of(
     width: int | None,
     folder: Path,
     numbers: Iterable[int] = (DECIDING,),
+    *,
     with_controls: bool = True,
     named: Collection[str] = (),
     masked_settings: Mapping[str, Any] = {},

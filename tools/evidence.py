@@ -115,20 +115,11 @@ def write(settings, folder):
         _copy(settings.figures, name, folder)
     (folder / "audit.md").unlink()  # the page beside the gallery has its numbers, too
     style.save_figure(few_keypoints.figure_of_few(few), folder, "few_keypoints", note)
-    told = not_explored(worths)
-    for artefact in (
-        report_worths.figure_of_worths(told),
-        report_worths.table_of_worths(told, NEW_STREETS),
-    ):
-        style.save(artefact, folder, note)
     for_readers = {
         "streets": streets,
         "few_keypoints": few_keypoints.table_of_few(few, times),
         "every_second": few_keypoints.table_of_few(few_keypoints.ratios_to_all(second_runs)),
         "refined_widths": table_of_widths(of_widths),
-        "in_place": table_of_places(worths),
-        "left_out": table_of_classes(worths),
-        "new_streets": table_of_new_streets(worths),
     }
     for name, rows in for_readers.items():
         timed_on = f"; {timing.told(times)}" if name == "few_keypoints" else ""
@@ -143,6 +134,7 @@ def write(settings, folder):
         # six digits are enough: shuffling the matched points changes more
         text = rows.to_csv(index=False, lineterminator="\n", float_format="%.6g")
         write_text(folder / f"{name}.csv", text)
+    judge(folder, note)
     draw(folder)
     findings = needed(settings.figures / "findings.md", "08_results").read_text(encoding="utf-8")
     write_text(
@@ -158,6 +150,25 @@ def write(settings, folder):
             },
         ),
     )
+
+
+@style.applied()
+def judge(folder, note):
+    """Write the tables and the figure of the worths in worth_runs.csv, judged by their check."""
+    worths = pd.read_csv(folder / "worth_runs.csv", dtype={"sequence": str})
+    told = not_explored(worths)
+    for artefact in (
+        report_worths.figure_of_worths(told),
+        report_worths.table_of_worths(told, NEW_STREETS),
+    ):
+        style.save(artefact, folder, note)
+    for_readers = {
+        "in_place": table_of_places(worths),
+        "left_out": table_of_classes(worths),
+        "new_streets": table_of_new_streets(worths),
+    }
+    for name, rows in for_readers.items():
+        style.save_table(rows, folder, name, note)
 
 
 @style.applied()

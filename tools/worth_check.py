@@ -2,12 +2,13 @@
 
 The drives are those of the demo profile, their label maps by the model in the package, as on real
 streets. All steps count. It writes keypoint_study/worth_check.csv, by which the tables of worths
-judge, and figures/worth_check.md. Four minutes of one core.
+judge, figures/worth_check.md, and the evidence's tables of worths, judged anew.
 """
 
 import pandas as pd
 from joblib import cpu_count
 
+import evidence
 import street_world
 from keypoint_study import worth, worth_check
 from keypoint_study.methods import METHODS, Asked
@@ -68,6 +69,9 @@ def main() -> None:
     table = worth_check.table_of_checks(estimated, true)
     text = table.to_csv(index=False, lineterminator="\n", float_format="%.4g")
     write_text(worth_check.TABLE, text)
+    worth_check.checks.cache_clear()
+    note = (evidence.FOLDER / "worth.md").read_text(encoding="utf-8").splitlines()[-1]
+    evidence.judge(evidence.FOLDER, note)
 
 
 if __name__ == "__main__":
