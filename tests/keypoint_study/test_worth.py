@@ -161,12 +161,16 @@ def test_the_true_worth_of_twice_the_noise_is_a_quarter(monkeypatch):
 
     def tracked(_, index, chosen, *__):
         random = np.random.default_rng(index)
-        return independent(random), {("noisy", 200): independent(random, 2 * NOISE)}
+        noisy, few = independent(random, 2 * NOISE), independent(random)
+        return independent(random), {("noisy", 200): noisy, ("few", 50): few}
 
     monkeypatch.setattr(worth, "tracked", tracked)
-    (row,) = worth_check.true_worths(drive, {}, 1).itertuples()
-    assert (row.choice, row.number, row.sequence) == ("noisy", 200, "00")
-    assert 0.15 < row.rotation < 0.4 and 0.15 < row.direction < 0.4
+    # few ones are compared with more random ones, and each tells as much as one of those
+    monkeypatch.setattr(worth, "MIN_RANDOM", 200)
+    noisy, few = worth_check.true_worths(drive, {}, 1).itertuples()
+    assert (noisy.choice, noisy.number, noisy.sequence) == ("noisy", 200, "00")
+    assert 0.15 < noisy.rotation < 0.4 and 0.15 < noisy.direction < 0.4
+    assert 0.6 < few.rotation < 1.6 and 0.6 < few.direction < 1.6
 
 
 def test_the_factor_off_is_the_largest_and_that_of_a_ratio_is_a_ratio(monkeypatch):
