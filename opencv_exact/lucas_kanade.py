@@ -7,7 +7,7 @@ the compiler vectorises the loops over the lanes. Each lane adds in OpenCV's ord
 takes eight at a time go into four partial sums, the last ones into a fifth.
 
 1. `_fill` takes LANES points from the queue of a level of the pyramid and reads their pixels.
-2. `_start` computes their templates, `_advance` moves all windows by one step.
+2. `_start` computes their templates, `_advance` and `_move` move all windows by one step.
 3. Once few lanes are still at work, their points go back into the queue.
 
 What the lanes work on is one record, so that the compiler sees that its parts do not overlap.
@@ -26,6 +26,7 @@ from opencv_exact.compiling import compiled, is_on_disk
 
 # Numba inlines these before LLVM sees them. Inlined by LLVM, most loops would stay scalar.
 inlined = partial(compiled, inline="always", no_cpython_wrapper=True)
+inner = partial(compiled, no_cpython_wrapper=True)  # not called by Python
 
 LANES = 16  # points tracked side by side, one in each lane
 WINDOW = 21  # side, pixels; a constant, so that the loops are unrolled
@@ -232,30 +233,37 @@ def track_points(block, previous, current, points, criteria):
     tracked = points.copy()
     # Those of the last level hold: OpenCV goes on with a point that a coarse level has lost.
     found, errors = np.empty(len(points), np.bool_), np.empty(len(points), np.float32)
+    templates = points.copy()  # corners
+    searches = np.empty((len(points), 5), np.float32)  # of the points that wait, see BLOCK
     top = len(previous.levels) - 1
     for level in range(top, -1, -1):
         scale = ONE / np.float32(1 << level)
+        # Loops, because Numba compiles a sum of arrays and an assignment of one for seconds.
         for i in range(len(points)):
+            found[i], errors[i] = False, 0
             for k in range(2):
                 tracked[i, k] = points[i, k] * scale if level == top else tracked[i, k] * TWO
-        found[:], errors[:] = False, 0
+                templates[i, k] = points[i, k] * scale - HALF
+                searches[i, k] = tracked[i, k] - HALF
+            for k in range(2, 5):
+                searches[i, k] = 0
         frames = previous.pixels, current.pixels, previous.levels[level]
-        templates = points * scale - HALF
-        _track_level(block[0], frames, templates, tracked, found, errors, criteria, level == 0)
+        _track_level(
+            block[0], frames, templates, searches, tracked, found, errors, criteria, level == 0
+        )
     return tracked, found, errors
 
 
-@compiled
-def _track_level(block, frames, templates, tracked, found, errors, criteria, is_last):
+@inlined
+def _track_level(block, frames, templates, searches, tracked, found, errors, criteria, is_last):
     """Move the tracked points (N, 2) on one level of the pyramid.
 
     frames: pixels of both pyramids, and the level's row. templates: corners (N, 2).
     """
     before, after, level = frames
     queue, is_inside = _queue(templates, level)
-    found[queue] = True
-    searches = np.zeros((len(tracked), 5), np.float32)  # of the points that wait, see BLOCK
-    searches[:, :2] = tracked - HALF
+    for i in queue:
+        found[i] = True
     lanes = np.empty(LANES, np.int64)  # the point in each lane, or IDLE
     first, waiting = 0, len(queue)
     while waiting > 0:
@@ -265,12 +273,15 @@ def _track_level(block, frames, templates, tracked, found, errors, criteria, is_
             lanes[lane] = queue[(first + lane) % len(queue)]
         first, waiting = (first + active) % len(queue), waiting - active
         inside = _read_templates(block, before, level, lanes, templates, is_inside, searches)
+        _place(block)
         _start(block, inside, level[0], level[1])
+        _write_matrices(block)
         _drop_weak(block, lanes, found, errors, criteria)
         taken = lanes.copy()
         while active > 0:
             _read_windows(block, after, level, lanes, found)
-            _advance(block, criteria.most_steps, criteria.squared_step)
+            _advance(block)
+            _move(block, criteria.most_steps, criteria.squared_step)
             active = _write_results(block, lanes, tracked)
             if active <= GO_ON and waiting >= LANES:
                 _keep_searches(block, lanes, taken, searches)
@@ -283,7 +294,7 @@ def _track_level(block, frames, templates, tracked, found, errors, criteria, is_
             _write_differences(block, after, level, taken, tracked, found, errors)
 
 
-@compiled
+@inner
 def _read_templates(block, pixels, level, lanes, templates, is_inside, searches):
     """Read the templates of the points in the lanes, and how far their searches are.
 
@@ -302,7 +313,7 @@ def _read_templates(block, pixels, level, lanes, templates, is_inside, searches)
     return inside
 
 
-@compiled
+@inner
 def _drop_weak(block, lanes, found, errors, criteria):
     """Let the points leave whose template is too even or has edges of one direction only."""
     for lane in range(LANES):
@@ -316,7 +327,7 @@ def _drop_weak(block, lanes, found, errors, criteria):
                 lanes[lane] = IDLE
 
 
-@compiled
+@inner
 def _keep_searches(block, lanes, taken, searches):
     """Keep how far the searches of the lanes at work are. They are no longer taken."""
     for lane in range(LANES):
@@ -326,7 +337,7 @@ def _keep_searches(block, lanes, taken, searches):
                 searches[lanes[lane], k] = block.search[k, lane]
 
 
-@compiled
+@inner
 def _queue(corners, level):
     """Indices of the points whose template touches the frame, and whether each point's lies inside.
 
@@ -355,7 +366,7 @@ def _touches(x, y, rows, columns):
     return x >= -WINDOW and x < columns and y >= -WINDOW and y < rows
 
 
-@compiled
+@inlined
 def _read(block, pixels, level, x, y, before, rows, lane):
     """Read rows of a lane's pixels, from `before` rows and columns before its corner on."""
     stride = np.uintp(level[1] + 2 * MARGIN)
@@ -418,27 +429,25 @@ def _blend(block, row, column, start, lane):
     )
 
 
-@partial(compiled, fastmath={"contract"})
+@partial(inner, fastmath={"contract"})
 def _start(block, inside, rows, columns):
-    """Compute the templates, their matrices and eigenvalues.
+    """Compute the templates.
 
     inside: whether all of them lie inside the frame with their neighbours.
     """
     _unpack(block, PATCH)
-    _place(block)
     for row in range(RING):
         for column in range(RING):
             for lane in range(LANES):
                 block.ring[row, column, lane] = np.int32(_blend(block, row, column, ZERO, lane))
     if inside:
-        _write_templates(block, True)
+        _write_inner_templates(block)
     else:
         _write_slopes(block, np.float32(rows), np.float32(columns))
-        _write_templates(block, False)
-    _write_matrices(block)
+        _write_templates(block)
 
 
-@compiled
+@inner
 def _place(block):
     """Write the weights of the templates and where their pixels begin."""
     for lane in range(LANES):
@@ -448,21 +457,34 @@ def _place(block):
 
 
 @inlined
-def _write_templates(block, inside):
-    """Write the pixels and slopes of the templates, rounded as OpenCV does."""
-    ring, template = block.ring, block.template
+def _write_inner_templates(block):
+    """Write the templates inside the frame."""
     for row in range(WINDOW):
         for column in range(WINDOW):
             for lane in range(LANES):
-                if inside:
-                    across, down = _slopes(ring, row, column, lane)
-                else:
-                    across = np.int32(_blend_slopes(block, 0, row, column, lane))
-                    down = np.int32(_blend_slopes(block, 1, row, column, lane))
-                pixel = ring[row + 1, column + 1, lane]
-                template[0, row, column, lane] = np.int32(pixel + 256) >> np.int32(9)
-                template[1, row, column, lane] = np.int32(across + 8192) >> np.int32(14)
-                template[2, row, column, lane] = np.int32(down + 8192) >> np.int32(14)
+                across, down = _slopes(block.ring, row, column, lane)
+                _write_template(block, row, column, lane, across, down)
+
+
+@inlined
+def _write_templates(block):
+    """Write the templates, which may lie at the border, with the slopes of the pixels."""
+    for row in range(WINDOW):
+        for column in range(WINDOW):
+            for lane in range(LANES):
+                across = np.int32(_blend_slopes(block, 0, row, column, lane))
+                down = np.int32(_blend_slopes(block, 1, row, column, lane))
+                _write_template(block, row, column, lane, across, down)
+
+
+@inlined
+def _write_template(block, row, column, lane, across, down):
+    """Write the pixel and slopes of a template, rounded as OpenCV does."""
+    template = block.template
+    pixel = block.ring[row + 1, column + 1, lane]
+    template[0, row, column, lane] = np.int32(pixel + 256) >> np.int32(9)
+    template[1, row, column, lane] = np.int32(across + 8192) >> np.int32(14)
+    template[2, row, column, lane] = np.int32(down + 8192) >> np.int32(14)
 
 
 @inlined
@@ -523,7 +545,7 @@ def _total(sums, k, lane):
     return (sums[4, k, lane] + pairs) * SCALE
 
 
-@compiled
+@inner
 def _write_matrices(block):
     """Write the sums of products of slopes, the determinants and the eigenvalues."""
     block.sums[:] = 0
@@ -550,7 +572,7 @@ def _write_matrices(block):
         block.place[0, lane] = NOWHERE
 
 
-@compiled
+@inner
 def _read_windows(block, pixels, level, lanes, found):
     """Read the windows that have moved to other pixels. Those outside the frame are lost."""
     _locate(block)
@@ -568,12 +590,12 @@ def _read_windows(block, pixels, level, lanes, found):
         _unpack_window(block)
 
 
-@compiled
+@inlined
 def _unpack_window(block):
     _unpack(block, WINDOW + 1)
 
 
-@compiled
+@inlined
 def _locate(block):
     """Write the weights of the windows. News: whether their pixels are others."""
     for lane in range(LANES):
@@ -584,9 +606,9 @@ def _locate(block):
         block.place[0, lane], block.place[1, lane] = x, y
 
 
-@partial(compiled, fastmath={"contract"})
-def _advance(block, most_steps, squared_step):
-    """Move all windows by a step."""
+@partial(inner, fastmath={"contract"})
+def _advance(block):
+    """Sum the differences of windows and templates times the slopes, in OpenCV's parts."""
     block.sums[:] = 0
     for row in range(WINDOW):
         for group in range(0, TAIL, 8):
@@ -601,7 +623,6 @@ def _advance(block, most_steps, squared_step):
                 a, b = _mismatch(block, row, column, lane)
                 block.sums[4, 0, lane] += np.float32(a)
                 block.sums[4, 1, lane] += np.float32(b)
-    _move(block, most_steps, squared_step)
 
 
 @inlined
@@ -614,7 +635,7 @@ def _mismatch(block, row, column, lane):
     return across, down
 
 
-@compiled
+@inner
 def _move(block, most_steps, squared_step):
     """Solve for the steps and take them. News: whether the searches go on."""
     sums, matrix, search = block.sums, block.matrix, block.search
@@ -637,7 +658,7 @@ def _move(block, most_steps, squared_step):
         block.news[lane] = OSCILLATES if is_back & ~is_small else np.int32(is_over)
 
 
-@compiled
+@inner
 def _write_results(block, lanes, tracked):
     """Write the points of the lanes at work, and let those leave whose search is over.
 
@@ -658,7 +679,7 @@ def _write_results(block, lanes, tracked):
     return active
 
 
-@compiled
+@inner
 def _write_differences(block, pixels, level, lanes, tracked, found, errors):
     """Write the mean difference of pixels between template and window as the points' errors.
 
@@ -680,7 +701,7 @@ def _write_differences(block, pixels, level, lanes, tracked, found, errors):
             errors[lanes[lane]] = block.eigenvalue[lane]
 
 
-@compiled
+@inlined
 def _compare(block):
     """Write the mean difference of pixels in place of the eigenvalue. The sums are exact."""
     block.sums[0] = 0

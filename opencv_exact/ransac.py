@@ -216,14 +216,14 @@ def _winner(points, samples):
     winner whose bounds are equal wins the real search, too. Samples are drawn when needed.
     """
     winner, most, needed = NO_WINNER, SAMPLE_SIZE - 1, MAX_SAMPLES
-    number = 0
-    while number < needed:
+    for number in range(MAX_SAMPLES):
+        if number >= needed:
+            break
         if samples.upper[number] < 0:
             _draw_block(points, samples, number)
         if samples.upper[number] > most:  # the first one if several are equal, as in OpenCV
             winner, most = number, samples.upper[number]
             needed = _samples_needed(points, most)
-        number += 1
     return winner
 
 
@@ -243,12 +243,14 @@ def _samples_needed(points, inliers):
     return round(log_failure / log_missed)
 
 
-@inlined
+@partial(compiled, inline="always")  # which compiles `solve` into one function less
 def _draw_block(points, samples, start):
     """Draw LANES samples, the first one being number `start`, and solve them for their bounds."""
-    stop = start + LANES
     indices, state = _draw(samples.random_state, points.columns.shape[1], LANES)
-    samples.indices[start:stop], samples.random_state[0] = indices, state[0]
+    samples.random_state[0] = state[0]
+    for lane in range(LANES):
+        for k in range(SAMPLE_SIZE):  # an assignment of the array would take seconds to compile
+            samples.indices[start + lane, k] = indices[lane, k]
     solutions = solve(correspondences(points.columns, indices))
     # as in OpenCV, a sample counts only if its own five correspondences are inliers
     best = max(SAMPLE_SIZE - 1, samples.lower.max())
