@@ -10,6 +10,7 @@ import pytest
 from scipy.stats import ttest_1samp, wilcoxon
 
 from keypoint_study import comparisons, ratios
+from keypoint_study.path_errors import ERRORS, path_errors
 from thesis import section_4_2
 
 EIGHT = [f"{number:02d}" for number in range(8)]
@@ -40,6 +41,14 @@ def primary(table):
 
 def ratio_of(rows, reference):
     return ratios.typical_ratio(ratios.ratios_of(rows, reference, "rmse"))
+
+
+def test_each_error_is_zero_for_the_truth_and_no_other_path():
+    """A new error with rows and columns of poses swapped fails here."""
+    true = made_up.winding(150)
+    right, wrong = path_errors(true, true), path_errors(made_up.winding(150, seed=0), true)
+    for name in ERRORS:
+        assert abs(right[name]) < 1e-4 < 1e-3 < wrong[name], name
 
 
 def test_known_ratios_are_found_and_inverted_by_swapping():
