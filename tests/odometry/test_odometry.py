@@ -135,8 +135,9 @@ def test_tracks_have_opencvs_bits(drive):
     frame = drive.frame(3)
     points = detect(frame)
     # at -40 a window leaves the frame
-    for shift, window in ((3, 21), (12, 21), (-40, 21), (12, 11)):
-        moved, settings = np.roll(frame, shift, axis=1), replace(THESIS, window=window)
+    for shift, window, levels in ((3, 21, 3), (12, 21, 3), (-40, 21, 3), (12, 11, 3), (12, 21, 1)):
+        moved = np.roll(frame, shift, axis=1)
+        settings = replace(THESIS, window=window, levels=levels)
         for ours, expected in zip(
             sharing.track(frame, moved, points, settings), track(frame, moved, points, settings)
         ):
