@@ -1,32 +1,41 @@
-"""What nobody used repeats nothing: an own copy of the packages gets new entries, and changes."""
+"""What nobody used repeats nothing: own copies of the packages get new entries, and changes."""
 
 import json
-import shutil
 import subprocess
 import sys
 
 import pytest
-from trials import ROOT
+from trials import copy_project
 
 pytestmark = pytest.mark.slow
 
-# the records of a run of each kind, and of the worth
+# The records of a run of each kind, and of the worth, of each copy of the packages in a process of
+# its own, which begins with what they import.
 SHOW = """
-import json, sys
+import json, os, sys
 from pathlib import Path
-from keypoint_study import jobs, runner, worth_runs
-from keypoint_study.sources import Source
-from thesis_repro.data.kitti import Sequence
+import cv2, joblib, matplotlib.pyplot, numba, pandas, scipy.spatial, scipy.stats, tqdm
 
-world, labels = map(Path, sys.argv[1:])
-sequence, source = Sequence(world / "kitti", "00").subset(3), Source(labels)
-shown = {"runs": runner._versions(runner.PATH, sequence)["code"]}
-shown["worth"] = runner._versions(worth_runs.WORTH, sequence)["code"]
-names = jobs.first_jobs([sequence], {"refined": (5,)}, tested=5)
-names.append(jobs.Job("00", "spread-anywhere", max_keypoints=100))
-for job, run in jobs.runs_of(names, [sequence], [source]).items():
-    shown[job.method] = runner.record_of(run)["code"]
-print(json.dumps(shown))
+world, labels, *copies = map(Path, sys.argv[1:])
+for copy in copies:
+    if os.fork():
+        assert os.wait()[1] == 0
+        continue
+    os.chdir(copy)
+    sys.path.insert(0, str(copy))
+    from keypoint_study import jobs, runner, worth_runs
+    from keypoint_study.sources import Source
+    from thesis_repro.data.kitti import Sequence
+
+    sequence, source = Sequence(world / "kitti", "00").subset(3), Source(labels)
+    shown = {"runs": runner._versions(runner.PATH, sequence)["code"]}
+    shown["worth"] = runner._versions(worth_runs.WORTH, sequence)["code"]
+    names = jobs.first_jobs([sequence], {"refined": (5,)}, tested=5)
+    names.append(jobs.Job("00", "spread-anywhere", max_keypoints=100))
+    for job, run in jobs.runs_of(names, [sequence], [source]).items():
+        shown[job.method] = runner.record_of(run)["code"]
+    print(json.dumps(shown), flush=True)
+    os._exit(0)
 """
 NEW = {
     "thesis_repro/odometry/keypoints.py": "def mine(frame, settings, mask=None):\n    return frame\n"
@@ -47,74 +56,51 @@ TABLES = {
 }
 
 
-@pytest.fixture(scope="module")
-def copy(tmp_path_factory):
-    root = tmp_path_factory.mktemp("copy")
-    for name in ("thesis_repro", "keypoint_study", "opencv_exact"):
-        shutil.copytree(ROOT / name, root / name, ignore=shutil.ignore_patterns("__pycache__"))
-    return root
+# (file, an old and a new text, the records that change)
+CHANGES = [
+    ("thesis_repro/odometry/loop.py", "MIN_MATCHES = 5", "MIN_MATCHES = 6", "runs worth"),
+    ("thesis_repro/data/kitti_odometry.py", '"times.txt"', '"time.txt"', "runs worth"),
+    ("thesis_repro/odometry/refined/fit.py", "eq=False", "eq=True", "masked worth"),
+    ("thesis_repro/odometry/keypoints.py", "middle = int(", "middle = round(", "spread-anywhere"),
+    ("keypoint_study/controls.py", "flip(masks", "transpose(masks", "mirrored random-lines"),
+    ("thesis_repro/masks/kinds.py", "2 * pixels + 1", "2 * pixels", "masked mirrored"),
+    ("keypoint_study/worth.py", "SPLITS, SEED = 12", "SPLITS, SEED = 13", "worth"),
+]
 
 
-@pytest.fixture(scope="module")
-def before(copy, small_world, small_labels):
-    return shown(copy, small_world, small_labels)
+def exchange(path, *changes):
+    text = path.read_text()
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new, 1)
+    path.write_text(text)
 
 
-def shown(copy, world, labels):
-    """All records, in a process of their own."""
-    code = f"import sys; sys.path.insert(0, {str(copy)!r})\n{SHOW}"
-    command = [sys.executable, "-c", code, *map(str, (world, labels))]
-    done = subprocess.run(command, cwd=copy, check=True, capture_output=True, text=True)
-    return json.loads(done.stdout)
-
-
-def test_a_new_entry_that_nobody_used_repeats_nothing(
-    copy, before, small_world, small_labels, tmp_path
-):
-    changed = tmp_path / "changed"
-    shutil.copytree(copy, changed)
+def add_what_nobody_uses(copy):
     for file, changes in TABLES.items():
-        text = (changed / file).read_text()
-        for old, new in changes:
-            assert old in text
-            text = text.replace(old, new)
-        (changed / file).write_text(text)
+        exchange(copy / file, *changes)
     for file, text in NEW.items():
-        place = changed / file
+        place = copy / file
         old = place.read_text() if place.exists() else ""
         first, table, last = old.partition("# {name: detector}")  # before the table
         place.write_text(f"{first}{text.split('DETECTORS')[0]}\n\n{table}{last}")
-    after = shown(changed, small_world, small_labels)
-    assert after == before
 
 
-@pytest.mark.parametrize(
-    "file, old, new, repeated",
-    [
-        ("thesis_repro/odometry/loop.py", "MIN_MATCHES = 5", "MIN_MATCHES = 6", "runs worth"),
-        ("thesis_repro/data/kitti_odometry.py", '"times.txt"', '"time.txt"', "runs worth"),
-        ("thesis_repro/odometry/refined/fit.py", "eq=False", "eq=True", "masked worth"),
-        (
-            "thesis_repro/odometry/keypoints.py",
-            "middle = int(",
-            "middle = round(",
-            "spread-anywhere",
-        ),
-        ("keypoint_study/controls.py", "flip(masks", "transpose(masks", "mirrored random-lines"),
-        ("thesis_repro/masks/kinds.py", "2 * pixels + 1", "2 * pixels", "masked mirrored"),
-        ("keypoint_study/worth.py", "SPLITS, SEED = 12", "SPLITS, SEED = 13", "worth"),
-    ],
-)
-def test_a_change_of_what_was_used_repeats_it(
-    copy, before, small_world, small_labels, tmp_path, file, old, new, repeated
-):
-    changed = tmp_path / "changed"
-    shutil.copytree(copy, changed)
-    text = (changed / file).read_text()
-    assert old in text
-    (changed / file).write_text(text.replace(old, new, 1))
-    after = shown(changed, small_world, small_labels)
-    different = {name for name in before if before[name] != after[name]}
-    assert set(repeated.split()) <= different
-    if file.endswith(("keypoints.py", "worth.py")):  # of one class or measure alone
-        assert different == set(repeated.split())
+def test_a_change_repeats_what_used_it_and_a_new_entry_nothing(small_world, small_labels, tmp_path):
+    copies = [tmp_path / str(number) for number in range(len(CHANGES) + 2)]
+    for copy in copies:
+        copy_project(("thesis_repro", "keypoint_study", "opencv_exact"), copy)
+    add_what_nobody_uses(copies[1])
+    for copy, (file, old, new, _) in zip(copies[2:], CHANGES, strict=True):
+        exchange(copy / file, (old, new))
+    words = map(str, (small_world, small_labels, *copies))
+    done = subprocess.run(
+        [sys.executable, "-c", SHOW, *words], check=True, capture_output=True, text=True
+    )
+    before, unused, *changed = map(json.loads, done.stdout.splitlines())
+    assert unused == before
+    for (file, _, _, repeated), after in zip(CHANGES, changed, strict=True):
+        different = {name for name in before if before[name] != after[name]}
+        assert set(repeated.split()) <= different, file
+        if file.endswith(("keypoints.py", "worth.py")):  # of one class or measure alone
+            assert different == set(repeated.split()), file

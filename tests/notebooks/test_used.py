@@ -10,6 +10,7 @@ import pytest
 from cells import NOTEBOOKS, executed_by
 from trials import PACKAGES, copy_project, finish, start, succeed
 
+from thesis import used
 from thesis.settings import ROOT
 
 OUTPUT = '"outputs": [{"output_type": "stream", "name": "stdout", "text": ["shown"]}]'
@@ -91,15 +92,19 @@ HOURS = 3600
 
 @pytest.mark.slow
 @pytest.mark.parametrize("ahead", [-2 * HOURS, 2 * HOURS])
-def test_a_clock_that_was_wrong_changes_nothing(project, tmp_path, ahead):
-    """Results and records get other dates; then 04 was made again, and 09 was changed."""
+def test_a_clock_that_was_wrong_changes_nothing(project, tmp_path, monkeypatch, ahead):
+    """Results and records get other dates; then 04 was made again, and 09 was changed.
+
+    The packages are those of the copy, so this process knows them.
+    """
+    monkeypatch.setattr(used, "ROOT", project)
     run = shutil.copytree(project / "run", tmp_path / "run")
 
     def planned():
         for number, path in enumerate(sorted(run.rglob("*"))):
             date = time.time() + ahead + number % 7
             os.utime(path, (date, date))
-        record(project, run)
+        used.record(run)
         return executed_by(plan(project, run))
 
     assert planned() == []
