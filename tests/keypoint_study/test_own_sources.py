@@ -25,6 +25,12 @@ T = np.arange(12) / 10  # times of the frames
 
 
 @pytest.fixture
+def no_figures(monkeypatch):
+    """A study that draws nothing, which spares most of its time."""
+    monkeypatch.setattr(report, "figures_of", lambda *_: ())
+
+
+@pytest.fixture
 def street(tmp_path, monkeypatch):
     """A root with the street of noise as sequences 00 and 01, and one mask for all frames."""
     for name in ("MAX_STEPS", "SPLITS", "FITS"):  # the worth takes longest; it has its own tests
@@ -64,12 +70,13 @@ def test_an_own_search_beside_an_estimator_with_its_own_is_refused(street, tmp_p
         Source(file, "keypoints").run(Sequence(street, "00"), settings)
 
 
+@pytest.mark.usefixtures("no_figures")
 def test_a_sequence_whose_true_poses_are_not_the_cameras_gets_no_verdict(street, capsys):
     write_kitti_poses(street / "poses/00.txt", np.linalg.inv(Street(12).poses))
     code, out = study(street, "--masks", street.parent / "masks")
     assert code == 0 and "poses/00.txt: " in capsys.readouterr().err
     assert set(pd.read_csv(out / "runs.csv", dtype=str)["sequence"]) == {"01"}
-    assert not (out / "paths-00.svg").exists() and (out / "paths-01.svg").is_file()
+    assert not (out / "paths/kitti/00").exists() and (out / "paths/kitti/01").is_dir()
     assert "are world-to-camera poses" in (out / "index.html").read_text()
     code, _ = study(street, "--masks", street.parent / "masks", "--sequences", "00")
     assert code == 1 and "poses/00.txt: " in capsys.readouterr().err
@@ -141,6 +148,7 @@ def test_own_functions_are_tried_before_the_study(street, text, said, capsys):
     assert error.count("own.py") == 1
 
 
+@pytest.mark.usefixtures("no_figures")
 def test_own_keypoints_are_drawn(street, capsys):
     path = street.parent / "own.py"
     path.write_text(DETECT.format(CORNERS))
@@ -177,6 +185,7 @@ def test_what_is_no_python_file_is_one_line(street, capsys, name, content, said)
     assert re.search(rf"{name}(, line 1)?: ", line) and said in line
 
 
+@pytest.mark.usefixtures("no_figures")
 def test_own_keypoints_have_controls_of_equal_number_and_their_flags_are_told(street, capsys):
     path = street.parent / "own.py"
     path.write_text(DETECT.format(f"{CORNERS}[:5]"))  # too few

@@ -180,7 +180,10 @@ def test_a_killed_study_resumes_and_ends_as_an_undisturbed_one(
     assert finished == {path: path.stat().st_mtime_ns for path in finished}
 
 
-def test_each_folder_of_label_maps_may_name_its_ids(small_world, small_labels, tmp_path):
+def test_each_folder_of_label_maps_may_name_its_ids(
+    small_world, small_labels, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(report, "figures_of", lambda *_: ())
     numbers = np.full(256, 255, np.uint8)  # train ids, by label id
     numbers[[ID[name] for name in TRAINED]] = range(len(TRAINED))
     for path in sorted((small_labels / "00").glob("*.png")):
@@ -191,7 +194,7 @@ def test_each_folder_of_label_maps_may_name_its_ids(small_world, small_labels, t
     where = ["--kitti", small_world / "kitti", "--sequences", "00", "--frames", 4]
     sources = ["--labels", f"mine={tmp_path / 'train'}:train", "--labels", tmp_path / "7:00"]
     counts = ["--widths", 5, "--repetitions", 1, "--estimator", "thesis", "--jobs", 1]
-    words = [*where, *sources, *counts, "--output", tmp_path / "out"]
+    words = [*where, *sources, *counts, "--without-worth", "--output", tmp_path / "out"]
     assert main(["study", *map(str, words)]) == 0
     runs = pd.read_csv(tmp_path / "out" / "runs.csv", keep_default_na=False).set_index("source")
     assert list(runs.index) == ["", "mine", "7-00"]
