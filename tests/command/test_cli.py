@@ -275,13 +275,6 @@ def test_a_new_detector_is_a_name_and_an_option(tiny_kitti, monkeypatch, capsys)
     assert "mine: Seven points, 50 % of which" in " ".join(capsys.readouterr().out.split())
 
 
-def test_a_study_leaves_out_the_worth_of_keypoints(small_world, small_labels, tmp_path):
-    quick = ["--sequences", "00", "--frames", 6, "--repetitions", 1, "--widths", 5, "--jobs", 1]
-    where = ["--kitti", small_world / "kitti", "--labels", small_labels, "--output", tmp_path]
-    assert run("study", *where, *quick, "--estimator", "thesis", "--without-worth") == 0
-    assert (tmp_path / "index.html").is_file() and not (tmp_path / "worth.csv").exists()
-
-
 def test_a_new_estimator_runs_in_a_study_only_if_it_is_asked_for(monkeypatch):
     monkeypatch.setitem(ESTIMATORS, "mine", Entry("my estimator", None))
     parser = build_parser(cli.COMMANDS, ["study"])

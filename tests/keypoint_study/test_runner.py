@@ -71,16 +71,15 @@ def test_only_missing_runs_are_run_again(small_world, small_labels, finished):
     assert (again.made, again.kept, len(again.reasons)) == (1, len(jobs) - 1, 0)
 
 
-@pytest.mark.parametrize("error", [OSError("pulled the plug"), RuntimeError("a fault")])
 def test_a_stopped_pass_is_repeated_and_ends_as_an_undisturbed_one(
-    small_world, small_labels, finished, tmp_path, monkeypatch, error
+    small_world, small_labels, finished, tmp_path, monkeypatch
 ):
     folder, jobs, _ = finished
     jobs = [job for job in jobs if job.method != "reduced"]
 
     def frame(self, index, original=Sequence.frame):
         if self.name == "01" and index == 8:
-            raise error
+            raise OSError("pulled the plug")
         return original(self, index)
 
     with monkeypatch.context() as patch:
@@ -89,7 +88,7 @@ def test_a_stopped_pass_is_repeated_and_ends_as_an_undisturbed_one(
             runs_of(jobs, opened(small_world), [Source(small_labels)]), tmp_path
         )
     assert set(outcome.table["sequence"]) == {"00"} and len(outcome.reasons) == 4
-    assert str(error) in outcome.warnings[0]
+    assert "pulled the plug" in outcome.warnings[0]
     times = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.csv")}
     runner.run_all(runs_of(jobs, opened(small_world), [Source(small_labels)]), tmp_path)
     assert times == {path: path.stat().st_mtime_ns for path in times} and len(times) == 4

@@ -180,7 +180,7 @@ def test_a_killed_study_resumes_and_ends_as_an_undisturbed_one(
     assert finished == {path: path.stat().st_mtime_ns for path in finished}
 
 
-def test_each_folder_of_label_maps_may_name_its_ids(
+def test_each_folder_of_label_maps_may_name_its_ids_and_the_worth_be_left_out(
     small_world, small_labels, tmp_path, monkeypatch
 ):
     monkeypatch.setattr(report, "figures_of", lambda *_: ())
@@ -198,6 +198,7 @@ def test_each_folder_of_label_maps_may_name_its_ids(
     assert main(["study", *map(str, words)]) == 0
     runs = pd.read_csv(tmp_path / "out" / "runs.csv", keep_default_na=False).set_index("source")
     assert list(runs.index) == ["", "mine", "7-00"]
+    assert (tmp_path / "out/index.html").is_file() and not (tmp_path / "out/worth.csv").exists()
     assert runs.loc["mine", "rmse"] == runs.loc["7-00", "rmse"] != runs.loc["", "rmse"]
 
 

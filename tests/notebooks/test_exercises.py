@@ -433,13 +433,6 @@ def test_label_maps_of_an_earlier_training_or_of_two_networks_are_named(images, 
     assert [label_maps_by()[0] for _ in range(2)] == ["the model of this run"] * 2
 
 
-def test_the_digest_of_the_model_in_the_package():
-    from thesis_repro.segmentation import prediction, training
-
-    digest = training.weights_digest(prediction.load_shipped())
-    assert digest == artefacts.NETWORK_IN_PACKAGE
-
-
 def test_label_maps_by_the_model_in_the_package_are_made_to_the_end(build):
     (build / "labels").unlink()
     earlier.label_maps()

@@ -8,7 +8,7 @@ from collections import Counter
 import nbformat
 import pytest
 from cells import NOTEBOOKS, code_of, named
-from nbconvert import PythonExporter, ScriptExporter
+from nbconvert import ScriptExporter
 
 from thesis.settings import ROOT
 
@@ -49,11 +49,12 @@ RENAMED = {"RandomBrightness": "RandomBrightnessContrast"}  # by the library
 
 
 @pytest.mark.parametrize("name", NOTEBOOKS)
-def test_notebooks_in_git_are_valid_and_have_no_outputs(name):
+def test_notebooks_in_git_are_valid_and_python_and_have_no_outputs(name):
     path = ROOT / "notebooks" / name
     nbformat.validate(nbformat.read(path, 4))
     in_git = json.loads(path.read_text())["cells"]
     assert not any(cell.get("outputs") or cell.get("execution_count") for cell in in_git)
+    assert ScriptExporter().from_filename(path)[1]["output_extension"] == ".py"
 
 
 def test_the_makefile_lists_the_notebooks_that_each_one_needs():
@@ -95,10 +96,3 @@ def test_what_the_copy_of_the_thesis_lacks_is_in_the_notebook_that_the_table_nam
     rows = re.findall(r"^\|[^|]*\| (\d\d) \| `([^|]*)` \|", table, re.MULTILINE)
     assert len(rows) == 7
     assert [row for row in rows if row[1] not in code_of(named(row[0]))] == []
-
-
-@pytest.mark.parametrize("name", NOTEBOOKS)
-def test_nbconvert_writes_python(name):
-    text, about = PythonExporter().from_filename(ROOT / "notebooks" / name)
-    assert ScriptExporter().from_filename(ROOT / "notebooks" / name)[0] == text
-    assert about["output_extension"] == ".py"
