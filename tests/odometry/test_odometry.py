@@ -594,6 +594,7 @@ def variants():
         "reduced": (replace(THESIS, max_keypoints=300), None),
         "refined": (replace(SMALL, estimator=refined), None),
         "kept": (replace(SMALL, redetect_below=450), None),  # tracks fractional positions on
+        "few levels": (replace(SMALL, levels=1), None),
         "filter": (replace(SMALL, detector=keypoints.filtered, min_distance=4.5), Stripes(40)),
         "orb": (replace(SMALL, detector=keypoints.orb), Stripes(40)),
         "empty": (THESIS, lambda index, frame: BLACK),
