@@ -17,6 +17,7 @@ from keypoint_study import ablations, controls
 from keypoint_study.controls import MadeMasks
 from keypoint_study.sources import Source
 from thesis_repro.data.cityscapes import LABELS
+from thesis_repro.data.ids import LABEL_IDS
 from thesis_repro.data.kitti import TRUE_LABELS, Sequence
 from thesis_repro.masks import MOVABLE, MaskSettings
 from thesis_repro.odometry import THESIS, OdometrySettings
@@ -137,8 +138,7 @@ def with_masks(settings: MaskSettings | None = None, **changes: Any) -> Callable
     """
 
     def choose(asked: Asked) -> Choice:
-        own = asked.source.settings
-        chosen = replace(settings or own, **{"ids": own.ids, **changes})
+        chosen = replace(settings or asked.source.settings, **changes)
         return masked(asked._replace(source=replace(asked.source, settings=chosen)))
 
     return choose
@@ -146,9 +146,9 @@ def with_masks(settings: MaskSettings | None = None, **changes: Any) -> Callable
 
 def from_true_labels(asked: Asked) -> Choice:
     """Run with masks from the true label maps."""
-    settings = replace(asked.source.settings, ids="labels")
     folder = asked.sequence.folder / TRUE_LABELS
-    return masked(asked._replace(source=replace(asked.source, folder=folder, settings=settings)))
+    source = replace(asked.source, folder=folder, ids=LABEL_IDS)
+    return masked(asked._replace(source=source))
 
 
 def found_by(detector: Callable, choose: Callable[[Asked], Choice]) -> Callable[[Asked], Choice]:

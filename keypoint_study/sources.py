@@ -3,7 +3,7 @@
 import re
 import runpy
 from collections.abc import Callable, Collection, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from traceback import walk_tb
@@ -14,6 +14,7 @@ import pandas as pd
 
 from thesis_repro import odometry
 from thesis_repro.data import label_ids
+from thesis_repro.data.ids import LABEL_IDS
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.data.trajectories import read_truth
 from thesis_repro.errors import InputError, cause
@@ -42,7 +43,7 @@ class Source:
     for a folder with a file of poses for each sequence.
     name: used in the names of its runs; empty if there is only one source.
     settings: how masks are made from label maps. invert: swap kept and ignored pixels of ready-made
-    masks.
+    masks. ids: what label maps hold, see `LabelMasks`.
     """
 
     folder: Path
@@ -50,6 +51,7 @@ class Source:
     name: str = ""
     settings: MaskSettings = MaskSettings()
     invert: bool = False
+    ids: str = LABEL_IDS
 
     @property
     def has_label_maps(self) -> bool:
@@ -69,7 +71,7 @@ class Source:
         if not self.has_label_maps:
             return MaskFolder(self.folder, sequence, self.invert)
         width = dilation_width if self.has_width else None
-        return LabelMasks(self.folder, sequence, width, self.settings)
+        return LabelMasks(self.folder, sequence, width, self.settings, self.ids)
 
     def file(self, sequence: str) -> Path:
         """Return the file of the keypoints, or of the path of a sequence."""
@@ -230,19 +232,20 @@ def named(
     folders: Iterable[tuple[str, str | None, Path]],
     settings: MaskSettings,
     invert: bool = False,
+    ids: str = LABEL_IDS,
 ) -> tuple[Source, ...]:
     """Return sources from (kind, name, folder). Without a name, that of the folder is used.
 
-    settings: for all masks from label maps; a folder of them may name its ids, as in FOLDER:train.
-    invert: for all ready-made masks.
+    settings, ids: for all masks from label maps; a folder of them may name its own ids, as in
+    FOLDER:train. invert: for all ready-made masks.
     Raises InputError for a name that cannot be a folder's name, and for equal names.
     """
     sources: list[Source] = []
     for kind, given_name, folder in folders:
-        of_source = settings
-        path, colon, ids = str(folder).rpartition(":")
+        ids_held = ids
+        path, colon, own_ids = str(folder).rpartition(":")
         if colon and kind == "labels" and not folder.is_dir():  # a folder's name may have a colon
-            folder, of_source = Path(path), replace(settings, ids=ids)
+            folder, ids_held = Path(path), own_ids
         if given_name is not None and not re.fullmatch(r"[\w+-]+( [\w+-]+)*", given_name):
             raise InputError(
                 f"--{kind} {given_name}={folder}: a name has letters, digits, '_', '+', '-' and single "
@@ -256,7 +259,8 @@ def named(
                 f"--{kind} {folder}: two sources would be called {name!r}; give one another name, "
                 f"--{kind} NAME={folder}"
             )
-        sources.append(Source(folder.absolute(), kind, name, of_source, invert and kind == "masks"))
+        is_inverted = invert and kind == "masks"
+        sources.append(Source(folder.absolute(), kind, name, settings, is_inverted, ids_held))
     return tuple(sources)
 
 
@@ -295,6 +299,6 @@ def check(
             for width in widths or (1,):
                 paths = source.masks(sequence, width).paths
             if source.has_label_maps:
-                label_ids.read(paths[0], source.settings.ids)
+                label_ids.read(paths[0], source.ids)
             else:
                 read_mask(paths[0], sequence.size, source.invert)

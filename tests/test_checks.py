@@ -11,7 +11,6 @@ from thesis.settings import read_settings
 from thesis_repro import checks
 from thesis_repro.command.cli import main
 from thesis_repro.data.kitti import Sequence
-from thesis_repro.masks import MaskSettings
 from thesis_repro.masks.folders import LabelMasks, MaskFolder
 from thesis_repro.running import files
 
@@ -174,7 +173,7 @@ def test_masks_that_cannot_be_right(tiny_kitti, tmp_path, kind, picture, options
         files.write_png(folder / name, picture)
     source = MaskFolder(folder, sequence)
     if kind == "labels":
-        source = LabelMasks(folder, sequence, 3, MaskSettings(**options))
+        source = LabelMasks(folder, sequence, 3, **options)
     line, warnings = checks.look_at_masks(source, sequence)
     assert ("label maps hold" in line) == (kind == "labels")
     assert [warning in line for line in warnings] == ([True] if warning else [])

@@ -239,7 +239,7 @@ def look_at_masks(
     if isinstance(source, LabelMasks):
         label_maps = [source.label_map(index) for index in sampled]
         of_classes = _class_shares(label_maps)
-        told = _label_map_doubts(label_maps, source.settings.ids)
+        told = _label_map_doubts(label_maps, source.ids)
         if source.dilation_width is not None:
             line += f" (width {source.dilation_width})"
         classes = zip(cityscapes.LABELS, of_classes, strict=False)

@@ -329,5 +329,6 @@ def _changed(source: Source) -> str:
     if not source.has_label_maps:
         return ""
     default = vars(MaskSettings())
-    settings = vars(source.settings).items()
-    return "".join(f"; {name} {value}" for name, value in settings if value != default[name])
+    settings = vars(source.settings) | {"ids": source.ids}
+    changed = [f"; {name} {value}" for name, value in settings.items() if value != default[name]]
+    return "".join(changed)

@@ -120,6 +120,7 @@ def test_ablations_and_few_keypoints_are_those_of_the_one_table(place, count):
 MADE_FROM = {  # another value of each argument
     "dilation_width": 7,
     "settings": masks.MaskSettings(margin=3),
+    "ids": "train",
     "invert": True,
     "make": controls.other_frame,
     "given": ["other masks"],

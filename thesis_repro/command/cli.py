@@ -176,7 +176,7 @@ def study(options: Any) -> int:
     planned = Study(
         options.kitti.absolute(),
         tuple(names or kitti.sequences(options.kitti)),
-        sources.named(options.sources, mask_settings, options.invert),
+        sources.named(options.sources, mask_settings, options.invert, options.ids),
         tuple(sorted(widths)),
         tested,
         tuple(dict.fromkeys(options.estimator)),
@@ -341,6 +341,7 @@ def _image_folders(root: Path, calibration: Path | None = None) -> list[tuple[Pa
 
 
 def _mask_settings(options: Any, has_labels: bool = True) -> Any:
+    from thesis_repro.data.ids import LABEL_IDS
     from thesis_repro.masks import MaskSettings
 
     settings = MaskSettings(
@@ -350,9 +351,8 @@ def _mask_settings(options: Any, has_labels: bool = True) -> Any:
         options.without_movable,
         options.margin,
         options.keep,
-        options.ids,
     )
-    if not has_labels and settings != MaskSettings():
+    if not has_labels and (settings, options.ids) != (MaskSettings(), LABEL_IDS):
         raise InputError(
             f"{', '.join(MASK_OPTIONS)}: need --labels DIR, label maps to make masks from"
         )
@@ -372,7 +372,7 @@ def _masks(options: Any, sequence: Any) -> Any:
     if vars(options).get("invert") and not ready_made:
         raise InputError("--invert: needs --masks DIR")
     if options.labels:
-        return LabelMasks(options.labels, sequence, options.dilation, settings)
+        return LabelMasks(options.labels, sequence, options.dilation, settings, options.ids)
     if ready_made:
         return MaskFolder(ready_made, sequence, options.invert)
     return None

@@ -1,7 +1,7 @@
 """Masks of a sequence in files: made from label maps on access, or read from images."""
 
 import os
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ import numpy as np
 from thesis_repro.data import label_ids
 from thesis_repro.data.cameras import Camera
 from thesis_repro.data.frames import say_once
+from thesis_repro.data.ids import LABEL_IDS
 from thesis_repro.data.kitti import Sequence, check_size
 from thesis_repro.errors import InputError
 from thesis_repro.masks import (
@@ -36,7 +37,9 @@ class LabelMasks:
     """Masks of a sequence, made from label maps on access: masks[i] for frame i.
 
     folder: holds one label map a frame, of any size, as a PNG with the frame's name, or a folder of
-    them for each sequence. dilation_width, settings: as in `keypoint_mask`.
+    them for each sequence. dilation_width, settings: as in `keypoint_mask`. ids: what the files
+    hold: Cityscapes' ids ("labels"), its "train" ids or its "colors", or else what the table of
+    this name or file names, see `label_ids.read`.
     Raises InputError if the folder or a frame's label map is missing.
     """
 
@@ -46,12 +49,14 @@ class LabelMasks:
         sequence: Sequence,
         dilation_width: int | None,
         settings: MaskSettings = THESIS_MASKS,
+        ids: str | Path = LABEL_IDS,
     ) -> None:
         self.paths = _label_map_paths(folder, sequence)
         self.frame_paths = sequence.frame_paths
         self.size = sequence.size
         self.dilation_width = dilation_width
-        self.settings = settings
+        self.settings = replace(settings, ids=LABEL_IDS)
+        self.ids = settings.ids if ids == LABEL_IDS else str(ids)  # the settings': until 2.0
         if settings.has_width:
             check_width(dilation_width, self.size)
 
@@ -62,7 +67,7 @@ class LabelMasks:
         """Label map of frame `index`, in label ids."""
         path = self.paths[index]
         status = os.stat(path)
-        return _read_once(path, self.settings.ids, status.st_mtime_ns, status.st_size)
+        return _read_once(path, self.ids, status.st_mtime_ns, status.st_size)
 
     def __getitem__(self, index: int) -> np.ndarray:
         label_map = self.label_map(index)
@@ -70,7 +75,7 @@ class LabelMasks:
 
     def record(self) -> list[Any]:
         """Return what the masks depend on beside files."""
-        table = label_ids.record(self.settings.ids)
+        table = label_ids.record(self.ids)
         return ["label maps", self.dilation_width, str(self.settings), table]
 
 
@@ -98,8 +103,8 @@ def write_masks(masks: LabelMasks, folder: str | Path) -> None:
             folder,
             labels=provenance.digest_of_files(masks.paths),
             size=masks.size,
-            **asdict(masks.settings),
-            **label_ids.record(masks.settings.ids),
+            **asdict(masks.settings) | {"ids": masks.ids},
+            **label_ids.record(masks.ids),
             dilation_width=masks.dilation_width,
             frames=provenance.digest_of_files(masks.frame_paths),
             code=digest_of_code(masks),

@@ -3,6 +3,7 @@
 MaskSettings chooses among them; its defaults are the thesis's.
 """
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
@@ -13,6 +14,7 @@ import cv2
 import numpy as np
 
 from thesis_repro.data.cityscapes import ID, N_CLASSES
+from thesis_repro.data.ids import LABEL_IDS
 from thesis_repro.errors import InputError
 from thesis_repro.masks.filter import CANNY, canny_edges, check_width, dilate, thesis_mask
 from thesis_repro.masks.memory import remembered
@@ -40,8 +42,7 @@ class MaskSettings:
     keypoints are allowed there, except with "static".
     margin: no keypoints within this many pixels of the frame's border. Points there are lost in the
     next frame, and networks that pad with zeros predict false boundaries there.
-    ids: what the files hold: Cityscapes' ids ("labels"), its "train" ids or its "colors", or else
-    what the table of this file names, see data/label_ids.
+    ids: deprecated, an argument of `LabelMasks` instead, as it says what files hold.
     Raises InputError for an unknown name or a bad number of pixels.
     """
 
@@ -51,7 +52,7 @@ class MaskSettings:
     movable: int | None = None
     margin: int = 0
     keep: str = "boundaries"
-    ids: str = "labels"
+    ids: str = LABEL_IDS
     canny: tuple[float, float] = CANNY
 
     @property
@@ -60,6 +61,9 @@ class MaskSettings:
         return KINDS[self.keep].has_width
 
     def __post_init__(self) -> None:
+        if self.ids != LABEL_IDS:
+            text = f"MaskSettings(ids={self.ids!r}) goes in 2.0; give ids to LabelMasks instead"
+            warnings.warn(text, DeprecationWarning, stacklevel=3)  # where settings are made
         for name in ("classes", "canny"):  # they are lists, if read from JSON
             object.__setattr__(self, name, tuple(getattr(self, name)))
         for name, choices in {"boundaries": BOUNDARIES, "keep": KINDS}.items():
@@ -159,7 +163,7 @@ def keypoint_mask(
 @cache  # a replaced copy is checked, which takes as long as a small mask
 def _is_thesis(settings: MaskSettings) -> bool:
     """Whether masks are the thesis's, of any ids."""
-    return settings == replace(THESIS_MASKS, ids=settings.ids)
+    return replace(settings, ids=LABEL_IDS) == THESIS_MASKS
 
 
 @remembered
