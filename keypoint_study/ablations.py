@@ -11,7 +11,7 @@ import numpy as np
 
 from thesis_repro import masks
 from thesis_repro.data.cityscapes import ID
-from thesis_repro.data.kitti import Sequence
+from thesis_repro.data.sequence import Sequence
 from thesis_repro.masks.folders import LabelMasks
 from thesis_repro.odometry import THESIS, metrics
 from thesis_repro.odometry.loop import detect, normalise, track

@@ -12,7 +12,7 @@ from scipy.spatial.distance import cdist
 
 from keypoint_study.sources import FileMasks
 from thesis_repro.data.cityscapes import ID
-from thesis_repro.data.kitti import Sequence
+from thesis_repro.data.sequence import Sequence
 from thesis_repro.masks import dilate
 from thesis_repro.masks.folders import LabelMasks
 from thesis_repro.odometry import THESIS, OdometrySettings

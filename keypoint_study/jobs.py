@@ -31,7 +31,8 @@ from keypoint_study.methods import (
     with_numbers,
 )
 from keypoint_study.sources import UNMASKED, Source
-from thesis_repro.data.kitti import TRUE_LABELS, Sequence
+from thesis_repro.data.kitti import TRUE_LABELS
+from thesis_repro.data.sequence import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.odometry import THESIS, OdometrySettings, estimators
 

@@ -18,7 +18,8 @@ from keypoint_study.controls import MadeMasks
 from keypoint_study.sources import Source
 from thesis_repro.data.cityscapes import LABELS
 from thesis_repro.data.ids import LABEL_IDS
-from thesis_repro.data.kitti import TRUE_LABELS, Sequence
+from thesis_repro.data.kitti import TRUE_LABELS
+from thesis_repro.data.sequence import Sequence
 from thesis_repro.masks import MOVABLE, MaskSettings
 from thesis_repro.odometry import THESIS, OdometrySettings
 from thesis_repro.odometry.keypoints import filled, filtered, orb, spread

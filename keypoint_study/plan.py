@@ -11,7 +11,7 @@ import pandas as pd
 
 from keypoint_study import comparisons, jobs, runner, sources, worth_runs
 from keypoint_study.sources import Source
-from thesis_repro.data.kitti import Sequence
+from thesis_repro.data.sequence import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.odometry import THESIS, metrics
 from thesis_repro.running import program, provenance

@@ -24,8 +24,8 @@ from keypoint_study.methods import AS_MANY, METHODS, STUDY
 from keypoint_study.path_errors import path_errors
 from keypoint_study.sources import Source
 from thesis_repro import odometry
-from thesis_repro.data.kitti import Sequence
 from thesis_repro.data.layout import layout_of
+from thesis_repro.data.sequence import Sequence
 from thesis_repro.errors import InputError, cause
 from thesis_repro.odometry.estimators import COMPARED
 from thesis_repro.odometry.runs import is_flagged, poses_of

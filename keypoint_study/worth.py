@@ -21,7 +21,7 @@ import pandas as pd
 
 import opencv_exact
 from keypoint_study import one_fit
-from thesis_repro.data.kitti import Sequence
+from thesis_repro.data.sequence import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.odometry import (
     THESIS,

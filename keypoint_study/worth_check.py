@@ -16,7 +16,7 @@ import pandas as pd
 
 from keypoint_study import ratios, worth
 from keypoint_study.worth import MOTIONS, SPLIT, Choices, Tracks
-from thesis_repro.data.kitti import Sequence
+from thesis_repro.data.sequence import Sequence
 from thesis_repro.odometry import Motion, metrics
 from thesis_repro.odometry.sharing import SharedCalls
 

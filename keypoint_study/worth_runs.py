@@ -18,7 +18,7 @@ from keypoint_study.sources import Source, own_calls
 from keypoint_study.verdicts import verdict
 from keypoint_study.worth import MOTIONS, ONE_FIT, worth_of
 from keypoint_study.worth_check import OVER, factor_off
-from thesis_repro.data.kitti import Sequence
+from thesis_repro.data.sequence import Sequence
 
 
 def worths_of(

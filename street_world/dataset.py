@@ -17,6 +17,7 @@ from joblib import cpu_count as cores
 
 from street_world import drives, street, textures
 from thesis_repro.data import kitti, trajectories
+from thesis_repro.data.memory import FRAME_TIME
 from thesis_repro.running import provenance
 from thesis_repro.running.code_used import digest_of_code
 from thesis_repro.running.files import progress, write_png, write_text
@@ -272,7 +273,7 @@ def _write_sequence_texts(root: Path, name: str, frames: int, scale: float, seed
         numbers = " ".join(f"{value:.12e}" for value in projection.ravel())
         lines.append(f"P{camera}: {numbers}\n")
     write_text(folder / "calib.txt", "".join(lines))
-    times = [f"{kitti.FRAME_TIME * k:.6e}\n" for k in range(frames)]
+    times = [f"{FRAME_TIME * k:.6e}\n" for k in range(frames)]
     write_text(folder / "times.txt", "".join(times))
     _, poses, _ = drives.way(name, frames, seed)
     path = root / "kitti" / "poses" / f"{name}.txt"

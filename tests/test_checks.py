@@ -10,7 +10,7 @@ from thesis import checked
 from thesis.settings import read_settings
 from thesis_repro import checks
 from thesis_repro.command.cli import main
-from thesis_repro.data.kitti import Sequence
+from thesis_repro.data.sequence import Sequence
 from thesis_repro.masks.folders import LabelMasks, MaskFolder
 from thesis_repro.running import files
 

@@ -4,8 +4,8 @@
 
 from typing import Any
 
-from thesis_repro.data.kitti import Sequence
 from thesis_repro.data.memory import SequenceLike
+from thesis_repro.data.sequence import Sequence
 from thesis_repro.errors import missing_package
 from thesis_repro.masks import MaskSettings, keypoint_mask
 from thesis_repro.masks.folders import LabelMasks

@@ -20,6 +20,7 @@ from thesis_repro.data import cityscapes, kitti
 from thesis_repro.data.geometry import centre_doubt
 from thesis_repro.data.ids import LABEL_IDS
 from thesis_repro.data.memory import are_impossible
+from thesis_repro.data.sequence import Sequence, check_size
 from thesis_repro.errors import InputError, one_line
 from thesis_repro.masks import coverage
 from thesis_repro.masks.folders import LabelMasks, MaskFolder
@@ -67,7 +68,7 @@ def check_kitti(root: Path) -> list[str]:
     with_truth = kitti.sequences(root)
     for name in kitti.with_frames(root):
         try:
-            sequence = kitti.Sequence(root, name)
+            sequence = Sequence(root, name)
             height, width = sequence.size
             if name in with_truth:
                 sequence.poses  # noqa: B018  raises InputError if there are none
@@ -97,7 +98,7 @@ def check_cityscapes(root: Path, splits: Iterable[str] = ("train", "val")) -> li
 
     def read_pair(pair: cityscapes.Pair) -> None:
         size = files.read_gray(pair.image).shape
-        kitti.check_size(pair.label, cityscapes.read_label_map(pair.label).shape, size, "its image")
+        check_size(pair.label, cityscapes.read_label_map(pair.label).shape, size, "its image")
 
     for split in splits:
         try:
@@ -140,19 +141,19 @@ def report(
 # Warnings, one line each: "place: what is wrong"
 
 
-def sequence_warnings(sequence: kitti.Sequence) -> list[str]:
+def sequence_warnings(sequence: Sequence) -> list[str]:
     """Warn of a principal point far from the middle of the frames, and of impossible steps."""
     doubt = centre_doubt(sequence.intrinsics, sequence.size)
     place = f"sequence {sequence.name}: {sequence.calibration_path.name}: "
     return [place + doubt] * bool(doubt) + sequence.doubts() + _step_warnings(sequence)
 
 
-def standing(sequence: kitti.Sequence) -> int:
+def standing(sequence: Sequence) -> int:
     """Return the number of true steps in which the camera hardly moves, so that flags are right."""
     return int((sequence.scales[1:] < STANDING).sum()) if sequence.has_truth else 0
 
 
-def _step_warnings(sequence: kitti.Sequence) -> list[str]:
+def _step_warnings(sequence: Sequence) -> list[str]:
     """Warn of steps longer or faster than what drives, and of gaps in the times."""
     intervals = np.diff(sequence.times)
     lengths, unit = sequence.scales[1:], "times in seconds, and the speed in metres a second"
@@ -212,7 +213,7 @@ def run_warnings(
     return [f"sequence {name}: {text}" for applies, text in told if applies]
 
 
-def input_warnings(sequence: kitti.Sequence, mask_sets: Iterable) -> list[str]:
+def input_warnings(sequence: Sequence, mask_sets: Iterable) -> list[str]:
     """Print what masks of a sequence hold, and return warnings of doubtful input."""
     warnings = sequence_warnings(sequence)
     for masks in mask_sets:
@@ -223,9 +224,7 @@ def input_warnings(sequence: kitti.Sequence, mask_sets: Iterable) -> list[str]:
     return warnings
 
 
-def look_at_masks(
-    source: LabelMasks | MaskFolder, sequence: kitti.Sequence
-) -> tuple[str, list[str]]:
+def look_at_masks(source: LabelMasks | MaskFolder, sequence: Sequence) -> tuple[str, list[str]]:
     """Look at about MASK_SAMPLES masks of a sequence, spread evenly over it.
 
     Returns one line that says what they keep, and what label maps hold, and at most one warning of

@@ -28,7 +28,7 @@ from keypoint_study import methods
 from keypoint_study.sources import Source
 from thesis.settings import ROOT
 from thesis_repro import masks, odometry
-from thesis_repro.data.kitti import Sequence
+from thesis_repro.data.sequence import Sequence
 from thesis_repro.masks import folders
 from thesis_repro.odometry import THESIS, Odometry, loop, sharing
 from thesis_repro.odometry.estimators import refined

@@ -35,6 +35,7 @@ from thesis import domain_gap, timing
 from thesis.reported import REPORTED
 from thesis.settings import PROFILES, ROOT, folder, read_settings
 from thesis_repro.data import cityscapes, kitti
+from thesis_repro.data.sequence import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.running import files, program, provenance
 from thesis_repro.segmentation import augmentation, prediction, training
@@ -267,7 +268,7 @@ def main(camvid, job="", trained=""):
         name = next(iter(by_seed))  # label maps take minutes, so only the first network makes them
         labels = root / "labels" / f"CamVid, {name}"
         for street in kitti.sequences(settings.kitti):
-            paths = kitti.Sequence(settings.kitti, street).frame_paths
+            paths = Sequence(settings.kitti, street).frame_paths
             prediction.write_label_maps(model, paths, labels / street)
         streets(settings, labels, out, note)
     program.summary(f"curves, scores and an example: {out}")

@@ -23,6 +23,7 @@ from keypoint_study.sources import Source
 from thesis import chapter4, excerpts, few_keypoints, section_4_2, timing
 from thesis.settings import read_settings
 from thesis_repro.data import kitti
+from thesis_repro.data.sequence import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.odometry import metrics
 from thesis_repro.running import program, provenance
@@ -67,7 +68,7 @@ texts.TEMPLATES.loader.searchpath.append(str(Path(__file__).parent))
 def opened(settings):
     """Return the sequences of a run, as its notebooks take them."""
     return [
-        kitti.Sequence(settings.kitti, name).subset(settings.sizes.frames)
+        Sequence(settings.kitti, name).subset(settings.sizes.frames)
         for name in kitti.sequences(settings.kitti)
     ]
 

@@ -13,7 +13,7 @@ import pandas as pd
 
 from thesis import excerpts
 from thesis.settings import ROOT
-from thesis_repro.data import kitti
+from thesis_repro.data.sequence import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.running import program
 from thesis_repro.running.files import progress
@@ -22,15 +22,15 @@ FOLDER = ROOT / "build" / "excerpts"
 RAW_DRIVE = "{date}/{date}_drive_{sequence}_sync"
 
 
-def opened(street: pd.Series, kitti_root: str, raw_root: str) -> kitti.Sequence:
+def opened(street: pd.Series, kitti_root: str, raw_root: str) -> Sequence:
     """Open the whole sequence of a row of the manifest. Raises InputError if it is not there."""
     if street["data"] == "odometry":
         if not kitti_root:
             raise InputError("KITTI: give the folder of KITTI's odometry benchmark")
-        return kitti.Sequence(kitti_root, street["sequence"], street["camera"])
+        return Sequence(kitti_root, street["sequence"], street["camera"])
     if not raw_root:
         raise InputError("RAW: give the folder of KITTI's raw drives, which holds days")
-    return kitti.Sequence(None, Path(raw_root) / RAW_DRIVE.format(**street), street["camera"])
+    return Sequence(None, Path(raw_root) / RAW_DRIVE.format(**street), street["camera"])
 
 
 def cut_streets(kitti_root: str, raw_root: str, folder: Path) -> dict[str, str]:

@@ -13,8 +13,8 @@ import thesis_repro as tr
 from keypoint_study.report import style
 from thesis import excerpts, frames
 from thesis.settings import read_settings
-from thesis_repro.data import kitti
 from thesis_repro.data.cityscapes import read_label_map
+from thesis_repro.data.sequence import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.odometry.loop import OPENCV, detect, normalise
 from thesis_repro.running import program
@@ -36,7 +36,7 @@ NOTE = (
 
 def opened(root, name):
     """Open a street of the evidence. Raises InputError if its frames are others."""
-    sequence = kitti.Sequence(root, name)
+    sequence = Sequence(root, name)
     if excerpts.differences(sequence, excerpts.read_manifest().loc[name]):
         raise InputError(f"{sequence.folder}: has other frames than the evidence; make excerpts")
     return sequence

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from thesis_repro.data.kitti import Sequence
+from thesis_repro.data.sequence import Sequence
 from thesis_repro.masks.folders import MaskFolder
 from thesis_repro.odometry import THESIS, Odometry, run_many
 from thesis_repro.odometry.estimators import refined

@@ -11,6 +11,7 @@ from keypoint_study.sources import Source
 from thesis import artefacts, few_keypoints, timing
 from thesis.settings import read_settings
 from thesis_repro.data import kitti
+from thesis_repro.data.sequence import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.masks import MaskSettings
 from thesis_repro.running import program
@@ -30,7 +31,7 @@ def main():
     width = mask_settings.pop("width")
     source = Source(labels, settings=MaskSettings(**mask_settings))
     sequences = [
-        kitti.Sequence(settings.kitti, name).subset(settings.sizes.frames)
+        Sequence(settings.kitti, name).subset(settings.sizes.frames)
         for name in kitti.sequences(settings.kitti)
     ]
     shortened = [sequence.subset(settings.sizes.timed_frames) for sequence in sequences]

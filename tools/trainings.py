@@ -23,6 +23,7 @@ from keypoint_study import comparisons, jobs, runner, verdicts
 from keypoint_study.sources import Source
 from thesis.settings import ROOT, read_settings
 from thesis_repro.data import cityscapes, kitti
+from thesis_repro.data.sequence import Sequence
 from thesis_repro.masks import WIDTHS
 from thesis_repro.running import files, program, provenance, workers
 from thesis_repro.segmentation import prediction, quality, training
@@ -98,7 +99,7 @@ def label_maps(settings, seed):
 def opened(settings):
     """Return the drives of the embedded world, shortened as for notebook 8."""
     return [
-        kitti.Sequence(settings.kitti, name).subset(settings.sizes.frames)
+        Sequence(settings.kitti, name).subset(settings.sizes.frames)
         for name in kitti.sequences(settings.kitti)
     ]
 

@@ -21,7 +21,7 @@ from keypoint_study.report.paths import figure_of_paths
 from keypoint_study.report.style import COLUMN_WIDTH, PAGE_WIDTH, Artefact
 from keypoint_study.sources import KINDS, UNMASKED, FileMasks, Source, own_calls
 from thesis_repro import checks
-from thesis_repro.data.kitti import Sequence
+from thesis_repro.data.sequence import Sequence
 from thesis_repro.data.trajectories import write_kitti_poses, write_tum
 from thesis_repro.errors import InputError, one_line
 from thesis_repro.masks import MaskSettings

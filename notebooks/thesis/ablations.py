@@ -17,7 +17,7 @@ from keypoint_study.runner import run_all, run_poses
 from keypoint_study.sources import Source
 from thesis_repro import masks
 from thesis_repro.data.cityscapes import ID, resize_bilinear
-from thesis_repro.data.kitti import Sequence
+from thesis_repro.data.sequence import Sequence
 from thesis_repro.masks import MaskSettings
 from thesis_repro.odometry import THESIS, metrics
 from thesis_repro.odometry.loop import detect, normalise, track

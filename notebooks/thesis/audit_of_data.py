@@ -20,7 +20,8 @@ from thesis.audit_of_tables import TIME_OF_NARROW, TIME_TOGETHER, TIME_TYPICAL, 
 from thesis.settings import Settings
 from thesis_repro.data import cityscapes
 from thesis_repro.data.cityscapes import ID, read_label_map
-from thesis_repro.data.kitti import TRUE_LABELS, Sequence
+from thesis_repro.data.kitti import TRUE_LABELS
+from thesis_repro.data.sequence import Sequence
 from thesis_repro.masks.folders import LabelMasks
 from thesis_repro.segmentation import augmentation, training
 

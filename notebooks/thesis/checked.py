@@ -7,6 +7,7 @@ from thesis import excerpts
 from thesis.settings import Settings
 from thesis_repro.checks import report
 from thesis_repro.data import cityscapes, kitti
+from thesis_repro.data.sequence import Sequence
 from thesis_repro.running import files
 
 
@@ -17,13 +18,13 @@ def check(settings: Settings) -> bool:
     changed: then the notebooks are executed again. Raises InputError if a file is missing.
     """
     for name, first, last in settings.ranges:
-        excerpts.cut(kitti.Sequence(settings.whole, name), first, last, settings.kitti, name)
+        excerpts.cut(Sequence(settings.whole, name), first, last, settings.kitti, name)
     path = settings.build / "checked"
     kitti_root = None if settings.kitti_is_embedded else settings.kitti
     cityscapes_root = None if settings.cityscapes_is_embedded else settings.cityscapes
     used: list[Path] = []
     for name in kitti.sequences(kitti_root) if kitti_root else ():
-        used += kitti.Sequence(kitti_root, name).subset(settings.sizes.frames).files
+        used += Sequence(kitti_root, name).subset(settings.sizes.frames).files
     splits = (
         (cityscapes_root, "train"),
         (cityscapes_root, "val"),

@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 
 from thesis_repro.data import cityscapes, kitti
+from thesis_repro.data.sequence import Sequence
 
 IMAGES = 100  # most images of a domain
 LABELLED_FRAMES = 50  # most frames of all drives together
@@ -55,7 +56,7 @@ def scores_of_models(
     return pd.DataFrame(rows)
 
 
-def labelled_frames(drives: list[kitti.Sequence]) -> list[cityscapes.Pair]:
+def labelled_frames(drives: list[Sequence]) -> list[cityscapes.Pair]:
     """Return evenly spread frames of sequences with their exact label maps; none for real data."""
     pairs = []
     for drive in drives:

@@ -16,6 +16,7 @@ from keypoint_study.jobs import CONTROL_WIDTH
 from thesis import artefacts
 from thesis.settings import ROOT, read_settings
 from thesis_repro.data import cityscapes, kitti
+from thesis_repro.data.sequence import Sequence
 from thesis_repro.running import files, provenance
 
 EVIDENCE = ROOT / "figures/kitti_excerpts"
@@ -23,14 +24,14 @@ SPLITS = ("train", "validation", "test")
 VALIDATION_SHARE = 0.2  # of the training images, as in notebook 1
 
 
-def drives() -> list[kitti.Sequence]:
+def drives() -> list[Sequence]:
     """Return the sequences of the run. Those of the embedded world are rendered if need be."""
     settings = read_settings()
     if settings.kitti_is_embedded:
         world = settings.sizes.world | {"seed": settings.seed, "jobs": settings.jobs}
         street_world.write(settings.world, **world, only="kitti", replace=True)
     names = kitti.sequences(settings.kitti)
-    return [kitti.Sequence(settings.kitti, name).subset(settings.sizes.frames) for name in names]
+    return [Sequence(settings.kitti, name).subset(settings.sizes.frames) for name in names]
 
 
 def label_maps() -> Path:

@@ -14,6 +14,7 @@ import pandas as pd
 
 from thesis.settings import ROOT, Settings
 from thesis_repro.data import kitti
+from thesis_repro.data.sequence import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.running import provenance
 from thesis_repro.running.files import write_text
@@ -28,7 +29,7 @@ def read_manifest() -> pd.DataFrame:
     return pd.read_csv(MANIFEST, dtype={"street": str, "sequence": str}).set_index("street")
 
 
-def digests(sequence: kitti.Sequence) -> dict[str, str]:
+def digests(sequence: Sequence) -> dict[str, str]:
     """Return the SHA-256 of a sequence's decoded gray frames, and that of its poses.
 
     Frames are hashed row by row, one after the other; poses as 12 numbers each, rounded.
@@ -40,7 +41,7 @@ def digests(sequence: kitti.Sequence) -> dict[str, str]:
     return {"frames": frames.hexdigest(), "poses": hashlib.sha256(poses.tobytes()).hexdigest()}
 
 
-def differences(sequence: kitti.Sequence, street: pd.Series) -> list[str]:
+def differences(sequence: Sequence, street: pd.Series) -> list[str]:
     """Return which of "frames" and "poses" differ from a row of the manifest."""
     if len(sequence) != street["last"] - street["first"] + 1:
         return ["frames", "poses"]
@@ -58,7 +59,7 @@ def is_evidence(settings: Settings) -> bool:
 def are_those_of_the_evidence(root: Path) -> bool:
     """Whether a folder's sequences are the manifest's, frame by frame and pose by pose."""
     manifest = read_manifest()
-    sequences = [kitti.Sequence(root, name) for name in kitti.sequences(root)]
+    sequences = [Sequence(root, name) for name in kitti.sequences(root)]
     if [sequence.name for sequence in sequences] != list(manifest.index):
         return False
     lengths = manifest["last"] - manifest["first"] + 1
@@ -68,8 +69,8 @@ def are_those_of_the_evidence(root: Path) -> bool:
 
 
 def cut(
-    sequence: kitti.Sequence, first: int, last: int, root: Path, name: str, every: int = 1
-) -> kitti.Sequence:
+    sequence: Sequence, first: int, last: int, root: Path, name: str, every: int = 1
+) -> Sequence:
     """Write some frames of a sequence as a sequence of a root in KITTI's layout, and return it.
 
     first, last: numbers of frames, from 0 on, the last one included. every: 2 takes every second of
@@ -105,7 +106,7 @@ def cut(
         for path, text in texts.items():  # what has not changed keeps its time
             if not path.is_file() or path.read_text(encoding="utf-8") != text:
                 write_text(path, text)
-    return kitti.Sequence(root, name)
+    return Sequence(root, name)
 
 
 def _lines(rows: Iterable) -> str:

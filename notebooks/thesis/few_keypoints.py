@@ -27,7 +27,7 @@ from keypoint_study.runner import run_all
 from keypoint_study.sources import Source
 from keypoint_study.verdicts import FEW_KEYPOINTS, verdict
 from thesis_repro import odometry
-from thesis_repro.data.kitti import Sequence
+from thesis_repro.data.sequence import Sequence
 from thesis_repro.running import provenance
 
 ESTIMATORS = {name: jobs.ESTIMATORS[name] for name in ("thesis", "refined")}  # of the verdict

@@ -15,11 +15,12 @@ from thesis import frames
 from thesis_repro import masks
 from thesis_repro.data import kitti
 from thesis_repro.data.cityscapes import read_label_map
+from thesis_repro.data.sequence import Sequence
 from thesis_repro.odometry import metrics
 from thesis_repro.odometry.loop import detect
 
 
-def row(result: Any, of_frames: Any, drive: kitti.Sequence) -> dict[str, float]:
+def row(result: Any, of_frames: Any, drive: Sequence) -> dict[str, float]:
     """Return a row of a table: the masks of a run over a drive, its keypoints and errors."""
     covered = [masks.coverage(of_frames[number]) for number in range(0, len(drive), 5)]
     return {
@@ -30,14 +31,14 @@ def row(result: Any, of_frames: Any, drive: kitti.Sequence) -> dict[str, float]:
     }
 
 
-def table_of_runs(drive: kitti.Sequence, runs: dict[str, tuple[Any, Any]]) -> pd.DataFrame:
+def table_of_runs(drive: Sequence, runs: dict[str, tuple[Any, Any]]) -> pd.DataFrame:
     """Run a drive with each (settings, masks), and return a row for each run."""
     results = tr.run_many(drive, runs)
     rows = {text: row(result, runs[text][1], drive) for text, result in results.items()}
     return pd.DataFrame(rows).T
 
 
-def counts(drive: kitti.Sequence, labels: Path, numbers: Rows[int], *how: Any) -> dict[str, float]:
+def counts(drive: Sequence, labels: Path, numbers: Rows[int], *how: Any) -> dict[str, float]:
     """Return what masks have on average over frames: coverage, keypoints, true boundaries.
 
     labels: folder of their label maps. how: width and settings, as in `keypoint_mask`. The last two
@@ -58,7 +59,7 @@ def counts(drive: kitti.Sequence, labels: Path, numbers: Rows[int], *how: Any) -
     return dict(pd.DataFrame(rows).mean())
 
 
-def parts(drive: kitti.Sequence, labels: Path) -> dict[str, np.ndarray]:
+def parts(drive: Sequence, labels: Path) -> dict[str, np.ndarray]:
     """Return parts of the thesis's masks of a drive: {what they are: (n, height, width) uint8}.
 
     With true label maps, a mask is divided into what lies near a true boundary and what does not.

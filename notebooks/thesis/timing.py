@@ -33,7 +33,7 @@ from thesis.reported import REPORTED
 from thesis.settings import ROOT, Settings, cores
 from thesis_repro import masks, odometry
 from thesis_repro.data.cityscapes import resize_bilinear
-from thesis_repro.data.kitti import Sequence
+from thesis_repro.data.sequence import Sequence
 from thesis_repro.masks import folders
 from thesis_repro.odometry.runs import Masks
 from thesis_repro.running.files import progress, write_text

@@ -187,7 +187,8 @@ def test_public_names():
     assert {*DETECTORS} <= {*tr.__all__}
     assert tr.__version__ == metadata.version("thesis-repro")
     assert (
-        tr.OdometrySettings() == tr.THESIS and tr.Sequence.__module__ == "thesis_repro.data.kitti"
+        tr.OdometrySettings() == tr.THESIS
+        and tr.Sequence.__module__ == "thesis_repro.data.sequence"
     )
     assert tr.keypoint_mask(np.full((8, 8), 7, np.uint8), (16, 32), 3).shape == (16, 32)
     assert tr.build_unet((32, 32, 1), 35, 2).output_shape == (None, 32, 32, 35)

@@ -18,7 +18,8 @@ from scipy.spatial.transform import Rotation, Slerp
 from street import Street
 
 from thesis_repro.command.cli import main
-from thesis_repro.data import kitti, trajectories
+from thesis_repro.data import trajectories
+from thesis_repro.data.sequence import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.masks.folders import LabelMasks, MaskFolder
 from thesis_repro.segmentation import prediction
@@ -145,7 +146,7 @@ def by_evo(name, times, truth):
 def test_poses_and_errors_are_those_of_evo(drives, name, missing, tmp_path, capsys):
     folder, options, times, truth = drives[name]
     calibration = options[1] if options else None
-    sequence = kitti.Sequence(None, folder, calibration=calibration)
+    sequence = Sequence(None, folder, calibration=calibration)
     at, poses = by_evo(name, times, truth)
     np.testing.assert_allclose(sequence.times, at, rtol=0, atol=3e-7)  # of seconds since 1970
     np.testing.assert_allclose(sequence.poses, poses, rtol=0, atol=1e-12)
@@ -219,61 +220,61 @@ def euroc(drives, tmp_path):
 
 def test_another_calibration_leaves_the_body_as_it_is(euroc, tmp_path, caplog):
     caplog.set_level("INFO")
-    expected = kitti.Sequence(None, euroc)
+    expected = Sequence(None, euroc)
     sensor = euroc / "mav0/cam0/sensor.yaml"
     text = sensor.read_text()
     without = text[: text.index("T_BS")] + text[text.index("rate_hz") :]
     (tmp_path / "own.yaml").write_text(without)
     (tmp_path / "own.txt").write_text("300 300 239.5 79.5")
     for name in ("own.yaml", "own.txt"):
-        sequence = kitti.Sequence(None, euroc, calibration=tmp_path / name)
+        sequence = Sequence(None, euroc, calibration=tmp_path / name)
         assert np.array_equal(sequence.poses, expected.poses) and sensor in sequence.files
     inverse = np.linalg.inv(T_BS).tolist()
     chain = {"cam0": dict(intrinsics=[9, 9, 9, 9], distortion_coeffs=[0] * 4, T_cam_imu=inverse)}
     (tmp_path / "chain.yaml").write_text(json.dumps(chain))
-    sequence = kitti.Sequence(None, euroc, calibration=tmp_path / "chain.yaml")
+    sequence = Sequence(None, euroc, calibration=tmp_path / "chain.yaml")
     np.testing.assert_allclose(sequence.poses, expected.poses, atol=1e-12)
     assert not any(record.levelname == "WARNING" for record in caplog.records)
     # poses of the body in another form are the camera's, and it is said
     trajectories.write_tum(tmp_path / "body.tum", expected.poses, expected.times)
-    sequence = kitti.Sequence(None, euroc, truth=tmp_path / "body.tum")
+    sequence = Sequence(None, euroc, truth=tmp_path / "body.tum")
     np.testing.assert_allclose(sequence.poses, expected.poses, atol=1e-9)
     assert "body.tum: poses are taken as the camera's" in caplog.text
     sensor.write_text(without)
-    kitti.Sequence(None, euroc)
+    Sequence(None, euroc)
     (line,) = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
     assert "data.csv: holds poses of a body" in line
 
 
 def test_times_of_frames_are_those_that_are_listed(euroc):
-    expected = kitti.Sequence(None, euroc).times
+    expected = Sequence(None, euroc).times
     frames, listed = euroc / "mav0/cam0/data", euroc / "mav0/cam0/data.csv"
     text = listed.read_text()
     for index, path in enumerate(sorted(frames.iterdir())):
         path.rename(frames / f"{index:06d}.png")
-    assert np.array_equal(kitti.Sequence(None, euroc).times, expected)  # in their order
+    assert np.array_equal(Sequence(None, euroc).times, expected)  # in their order
     lines = text.splitlines()
     named = [f"{line.split(',')[0]},{index:06d}.png" for index, line in enumerate(lines[1:])]
     listed.write_text("\n".join([lines[0], *named, "1500000000000000000,gone.png", ""]))
-    assert np.array_equal(kitti.Sequence(None, euroc).times, expected)
+    assert np.array_equal(Sequence(None, euroc).times, expected)
     listed.write_text("\n".join(named[:-1]))
     with pytest.raises(InputError, match="data.csv: has no time of 000029.png"):
-        kitti.Sequence(None, euroc)
+        Sequence(None, euroc)
     listed.write_text("\n".join([named[1], *named[1:]]))
     with pytest.raises(InputError, match="data.csv: has no time of 000000.png"):
-        kitti.Sequence(None, euroc)
+        Sequence(None, euroc)
     listed.write_text("\n".join(named).replace(named[3].split(",")[0], "14037"))
     with pytest.raises(InputError, match="data.csv: .*must increase"):
-        kitti.Sequence(None, euroc)
+        Sequence(None, euroc)
     listed.unlink()  # no times are stated, so poses cannot belong to frames by time
     with pytest.raises(InputError, match="data.csv: .*--fps"):
-        kitti.Sequence(None, euroc)
+        Sequence(None, euroc)
 
 
 def test_masks_and_label_maps_belong_to_frames_without_distortion(
     euroc, small_model, tmp_path, capsys
 ):
-    sequence = kitti.Sequence(None, euroc).subset(4)
+    sequence = Sequence(None, euroc).subset(4)
     one = np.full(sequence.size, 255, np.uint8)
     one[:40] = 0
     for path, frame in zip(sequence.frame_paths, sequence):
@@ -298,7 +299,7 @@ def test_masks_and_label_maps_belong_to_frames_without_distortion(
     for images, output in ((euroc, "maps"), (tmp_path / "straight", "expected")):
         words = ["predict", "--images", str(images), "--model", str(small_model)]
         assert main([*words, "--output", str(tmp_path / output)]) == 0
-    first = len(sorted((euroc / "mav0/cam0/data").iterdir())) - len(kitti.Sequence(None, euroc))
+    first = len(sorted((euroc / "mav0/cam0/data").iterdir())) - len(Sequence(None, euroc))
     assert first > 0 and len(list((tmp_path / "maps").glob("*.png"))) == COUNT
     source = LabelMasks(tmp_path / "maps", sequence, 3)
     for index, path in enumerate(sequence.frame_paths):
@@ -311,6 +312,6 @@ def test_masks_and_label_maps_belong_to_frames_without_distortion(
     with pytest.raises(InputError, match="raw: made of frames with other distortion"):
         LabelMasks(tmp_path / "raw", sequence, 3)
     (tmp_path / "lens.txt").write_text("300 300 239.5 79.5 -0.2 0 0 0")
-    other = kitti.Sequence(None, euroc, calibration=tmp_path / "lens.txt").subset(4)
+    other = Sequence(None, euroc, calibration=tmp_path / "lens.txt").subset(4)
     with pytest.raises(InputError, match="maps: made of frames with other distortion"):
         LabelMasks(tmp_path / "maps", other, 3)

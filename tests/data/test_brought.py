@@ -24,6 +24,7 @@ from thesis_repro.data.cityscapes import (
 )
 from thesis_repro.data.frames import times_in_names, white_level
 from thesis_repro.data.ids import names
+from thesis_repro.data.sequence import Sequence
 from thesis_repro.data.trajectories import read_poses, read_poses_at, write_tum
 from thesis_repro.errors import InputError
 from thesis_repro.masks import folders
@@ -56,7 +57,7 @@ def test_names_that_are_numbers_are_in_their_order(own, caplog, stems, said):
         path.rename(own / f"{stem}.png")
     caplog.set_level("INFO")
     for _ in range(2):
-        assert [path.stem for path in kitti.Sequence(None, own).frame_paths] == stems
+        assert [path.stem for path in Sequence(None, own).frame_paths] == stems
     lines = [line for line in caplog.messages if "in the order of" in line]
     assert len(lines) == bool(said) and all(f"names as {said}, " in line for line in lines)
 
@@ -65,14 +66,14 @@ def test_names_in_two_possible_orders_are_refused(own):
     for path, stem in zip(own.glob("*.png"), ["7.37811111", "7.141574123", "7.2453477", "8.3"]):
         path.rename(own / f"{stem}.png")
     with pytest.raises(InputError, match="own: 7.*png and the like may be decimal numbers, or"):
-        kitti.Sequence(None, own)
+        Sequence(None, own)
 
 
 def test_assumed_times_are_said_once(own, caplog):
     (own / "times.txt").unlink()
     caplog.set_level("INFO")
     for fps in (None, None, 25):
-        kitti.Sequence(None, own, fps=fps)
+        Sequence(None, own, fps=fps)
     (line,) = caplog.messages
     assert "times.txt: no such file, so 10 frames a second" in line and "--fps" in line
 
@@ -97,7 +98,7 @@ def lines(rows):
 )
 def test_poses_with_the_number_of_the_frame_and_with_four_rows(own, rows):
     (own / "poses.txt").write_text(lines(rows))
-    assert np.array_equal(kitti.Sequence(None, own).poses, POSES)
+    assert np.array_equal(Sequence(None, own).poses, POSES)
     rows = rows + np.eye(*rows.shape)  # another number, rotation or last row
     (own / "poses.txt").write_text(lines(rows))
     with pytest.raises(InputError, match="poses.txt"):
@@ -105,12 +106,12 @@ def test_poses_with_the_number_of_the_frame_and_with_four_rows(own, rows):
 
 
 def test_poses_in_the_folder_of_a_sequence(tiny_kitti):
-    expected = kitti.Sequence(tiny_kitti, "00").poses
+    expected = Sequence(tiny_kitti, "00").poses
     folder = (tiny_kitti / "sequences/00").rename(tiny_kitti / "sequences/mine")
     (tiny_kitti / "poses/00.txt").rename(folder / "poses.txt")
     assert kitti.sequences(tiny_kitti) == ["mine"]
     for root, name in ((tiny_kitti, "mine"), (None, folder)):
-        assert np.array_equal(kitti.Sequence(root, name).poses, expected)
+        assert np.array_equal(Sequence(root, name).poses, expected)
 
 
 def euroc(path, poses, times):
@@ -129,26 +130,26 @@ def test_ground_truth_with_times_is_given_to_the_frames_of_these_times(own, name
     poses[:, 2, 3] = np.arange(len(times))
     write(own / name, poses, times)
     caplog.set_level("INFO")
-    sequence = kitti.Sequence(None, own, truth=own / name)
+    sequence = Sequence(None, own, truth=own / name)
     assert [path.stem for path in sequence.frame_paths] == ["000001", "000002", "000003"]
     np.testing.assert_allclose(sequence.times, [0.1, 0.2, 0.3])
     np.testing.assert_allclose(sequence.poses[:, 2, 3], [0, 20, 40])
     assert "3 of 4 frames" in caplog.text
     kept = np.abs(times - 0.2) > 0.02  # a gap around the third frame
     write(own / name, poses[kept], times[kept])
-    sequence = kitti.Sequence(None, own, truth=own / name)
+    sequence = Sequence(None, own, truth=own / name)
     assert [path.stem for path in sequence.frame_paths] == ["000001", "000003"]
     np.testing.assert_allclose(sequence.poses[:, 2, 3], [0, 40])
     assert "2 of 4 frames, which are used; 1 between them, the first one 000002.png" in caplog.text
-    sequence = kitti.Sequence(None, own, truth=own / name, truth_within=0.03)
+    sequence = Sequence(None, own, truth=own / name, truth_within=0.03)
     np.testing.assert_allclose(sequence.poses[:, 2, 3], [0, 24, 40])
-    sequence = kitti.Sequence(None, own, speed=2)  # needs no pose
+    sequence = Sequence(None, own, speed=2)  # needs no pose
     np.testing.assert_allclose(sequence.scales, [0, 0.2, 0.2, 0.2])
     write(own / name, poses, times + 100)
     with pytest.raises(InputError, match=rf"{name}: no pose .*100.102 to 100.347.*0 to 0.3"):
-        kitti.Sequence(None, own, truth=own / name)
+        Sequence(None, own, truth=own / name)
     with pytest.raises(InputError, match="gone.txt: cannot be read"):
-        kitti.Sequence(None, own, truth=own / "gone.txt")
+        Sequence(None, own, truth=own / "gone.txt")
 
 
 def test_quaternions_need_their_length(own):
@@ -158,7 +159,7 @@ def test_quaternions_need_their_length(own):
         scaled = np.column_stack([rows[:, :4], factor * rows[:, 4:]])
         (own / "truth.txt").write_text(lines(scaled))
         with pytest.raises(InputError, match="truth.txt: .*length 1"):
-            kitti.Sequence(None, own, truth=own / "truth.txt")
+            Sequence(None, own, truth=own / "truth.txt")
 
 
 NED = np.eye(4)[[1, 2, 0, 3]].T  # of the camera: x forward, y right, z down
@@ -182,13 +183,13 @@ def test_poses_of_other_data_sets_come_with_what_converts_them(own, name, header
     path = own / re.search(r"loadtxt\('(.*?)'", trajectories.CONVERSIONS[name])[1]
     path.write_text(header + lines(MATRICES[name]))
     with pytest.raises(InputError, match=f"{path.name}: .*{name}") as told:
-        kitti.Sequence(None, own, truth=path)
+        Sequence(None, own, truth=path)
     code = str(told.value).split("in Python: ")[1]
     monkeypatch.chdir(own)
     copied = []
     copies = SimpleNamespace(copy=lambda path, folder: copied.append(path))
     exec(code, {"np": np, "Rotation": Rotation, "shutil": copies})
-    np.testing.assert_allclose(kitti.Sequence(None, own).poses, POSES, atol=1e-9)
+    np.testing.assert_allclose(Sequence(None, own).poses, POSES, atol=1e-9)
     assert len(copied) == (4 if name == "KITTI-360" else 0)
 
 
@@ -393,10 +394,10 @@ def block(numbers):
     ],
 )
 def test_distortion_is_taken_out_as_opencv_does(own, name, text):
-    raw = kitti.Sequence(None, own).frame(2)
+    raw = Sequence(None, own).frame(2)
     (own / "calib.txt").unlink()
     (own / name).write_text(text)
-    sequence = kitti.Sequence(None, own, calibration=own / name)
+    sequence = Sequence(None, own, calibration=own / name)
     assert np.array_equal(sequence.intrinsics, [[50, 0, 32], [0, 51, 24], [0, 0, 1]])
     expected = cv2.undistort(raw, sequence.intrinsics, np.array(NUMBERS[4:]))
     assert np.array_equal(sequence.frame(2), expected) and (expected != raw).any()
@@ -419,7 +420,7 @@ def test_distortion_is_taken_out_as_opencv_does(own, name, text):
 def test_another_file_is_no_camera(own, name, text):
     (own / name).write_text(text)
     with pytest.raises(InputError, match=f"{name}: must hold fx fy cx cy"):
-        kitti.Sequence(None, own, calibration=own / name)
+        Sequence(None, own, calibration=own / name)
 
 
 @pytest.mark.parametrize(
@@ -440,7 +441,7 @@ def test_another_file_is_no_camera(own, name, text):
 def test_a_camera_of_another_model_is_named(own, text, model):
     (own / "camera.yaml").write_text(text)
     with pytest.raises(InputError, match=f"camera.yaml: {model}"):
-        kitti.Sequence(None, own, calibration=own / "camera.yaml")
+        Sequence(None, own, calibration=own / "camera.yaml")
 
 
 @pytest.mark.parametrize(
@@ -458,7 +459,7 @@ def test_a_camera_of_another_model_is_named(own, text, model):
 )
 def test_a_camera_of_frames_of_another_size_is_named(own, text):
     (own / "camera.yaml").write_text(text)
-    sequence = kitti.Sequence(None, own, calibration=own / "camera.yaml")
+    sequence = Sequence(None, own, calibration=own / "camera.yaml")
     with pytest.raises(InputError, match=r"camera.yaml: .*, but .*000000.png has 64x48"):
         sequence.frame(0)
 
@@ -484,7 +485,7 @@ S_rect_02: 65 48
 )
 def test_a_camera_is_a_matrix(own, text):
     (own / "camera.txt").write_text(text)
-    sequence = kitti.Sequence(None, own, calibration=own / "camera.txt")
+    sequence = Sequence(None, own, calibration=own / "camera.txt")
     assert np.array_equal(sequence.intrinsics, [[50, 0, 32], [0, 51, 24], [0, 0, 1]])
     assert not sequence.distortion.any() and sequence.size == (48, 64)
 
@@ -531,25 +532,25 @@ def test_what_has_no_stated_times_is_not_matched_by_time(own):
     write_tum(own / "truth.txt", POSES, np.arange(4) / 30)
     (own / "times.txt").unlink()
     with pytest.raises(InputError, match="truth.txt: .*--fps"):
-        kitti.Sequence(None, own, truth=own / "truth.txt")
-    poses = kitti.Sequence(None, own, truth=own / "truth.txt", fps=30).poses
+        Sequence(None, own, truth=own / "truth.txt")
+    poses = Sequence(None, own, truth=own / "truth.txt", fps=30).poses
     np.testing.assert_allclose(poses, POSES, atol=1e-9)
 
 
 def test_a_rough_camera_is_four_numbers(own):
     (own / "camera.txt").write_text("64 64 32 24")
-    sequence = kitti.Sequence(None, own, calibration=own / "camera.txt")
+    sequence = Sequence(None, own, calibration=own / "camera.txt")
     assert np.array_equal(sequence.intrinsics, [[64, 0, 32], [0, 64, 24], [0, 0, 1]])
-    assert np.array_equal(sequence.frame(0), kitti.Sequence(None, own).frame(0))
+    assert np.array_equal(sequence.frame(0), Sequence(None, own).frame(0))
 
 
 def test_hot_pixels_do_not_make_16_bit_frames_dark(own, caplog):
-    expected = kitti.Sequence(None, own).frame(0)
+    expected = Sequence(None, own).frame(0)
     for path in sorted(own.glob("*.png")):
         frame = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE).astype(np.uint16) * 16
         frame[5, 5] = 65535
         cv2.imwrite(str(path), frame)
-    frame = kitti.Sequence(None, own).frame(0)
+    frame = Sequence(None, own).frame(0)
     assert np.abs(np.delete(frame, 5, 0).astype(int) - np.delete(expected, 5, 0)).max() <= 2
     path = own / "000000.png"
     resized = read_image(path, 24, 32, white=white_level(path))  # as a network gets it
@@ -561,7 +562,7 @@ def test_thermal_frames_are_told_before_they_are_flat(own, caplog):
     for path in sorted(own.glob("*.png")):
         frame = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE).astype(np.uint16)
         cv2.imwrite(str(path), 20000 + 4 * frame)
-    assert kitti.Sequence(None, own).frame(0).min() > 230
+    assert Sequence(None, own).frame(0).min() > 230
     (record,) = [record for record in caplog.records if record.levelname == "WARNING"]
     assert "gray levels" in record.getMessage()
 
@@ -571,15 +572,15 @@ def test_frames_of_two_cameras_in_one_folder_are_refused(own, kinds):
     for index, path in enumerate(sorted(own.glob("*.png"))):
         path.rename(own / f"{kinds[index % 2]}{index // 2:03d}.png")
     with pytest.raises(InputError, match=rf"own: holds .*{kinds[1]}\*.png"):
-        kitti.Sequence(None, own)
+        Sequence(None, own)
 
 
 def test_frames_of_16_bits_are_scaled_by_their_maximum(own, caplog):
     caplog.set_level("INFO")
-    expected = [kitti.Sequence(None, own).frame(index) for index in range(4)]
+    expected = [Sequence(None, own).frame(index) for index in range(4)]
     for path, frame in zip(sorted(own.glob("*.png")), expected):
         cv2.imwrite(str(path), frame.astype(np.uint16) * 16)
-    sequence = kitti.Sequence(None, own)
+    sequence = Sequence(None, own)
     white = int(expected[0].max())
     for index, frame in enumerate(sequence):
         exact = np.minimum(expected[index].astype(float) * 255 / white, 255)
@@ -624,7 +625,7 @@ def objects(*values):
     [(1, 2, 3), (255, 1, 40), (1001, 2002, 10000), [(0, 0, 1), (0, 128, 0), (128, 128, 0)]],
 )
 def test_inverted_masks_leave_out_every_object(tiny_kitti, tmp_path, values):
-    frames = kitti.Sequence(tiny_kitti, "00")
+    frames = Sequence(tiny_kitti, "00")
     cv2.imwrite(str(tmp_path / "objects.png"), objects(*values))
     expected = np.where(objects(1, 1, 1), 0, 255)
     masks = folders.MaskFolder(tmp_path / "objects.png", frames, invert=True)
@@ -641,7 +642,7 @@ def test_soft_masks_have_one_limit_for_all_frames(tmp_path):
 
 @pytest.mark.parametrize("name", ["masks.npz", "masks.mp4", "masks.json"])
 def test_masks_that_are_no_images_are_named(tiny_kitti, tmp_path, name):
-    frames = kitti.Sequence(tiny_kitti, "00")
+    frames = Sequence(tiny_kitti, "00")
     (tmp_path / "masks").mkdir()
     (tmp_path / "masks" / name).write_bytes(b"masks")
     for path in (tmp_path / "masks", tmp_path / "masks" / name):
@@ -680,12 +681,12 @@ def picture_frames(own, hidden, alpha):
 def test_no_keypoints_in_transparent_parts_and_black_borders(own, alpha):
     hidden = np.zeros((48, 64), bool)
     hidden[:5], hidden[:, 60:] = True, True
-    plain = kitti.Sequence(None, own)
+    plain = Sequence(None, own)
     assert plain.visible(0) is None
     with pytest.raises(InputError, match="own: frames have no black border"):
         plain.without_border()
     picture_frames(own, hidden, alpha)
-    sequence = kitti.Sequence(None, own)
+    sequence = Sequence(None, own)
     if not alpha:
         assert sequence.visible(1) is None
         sequence = sequence.without_border()
@@ -711,7 +712,7 @@ def test_no_keypoints_in_transparent_parts_and_black_borders(own, alpha):
 
 def test_what_the_camera_did_not_see_has_no_keypoints(own):
     (own / "camera.txt").write_text("50 50 32 24 0.4 0 0 0")
-    sequence = kitti.Sequence(None, own, calibration=own / "camera.txt")
+    sequence = Sequence(None, own, calibration=own / "camera.txt")
     black = sequence.undistorted(np.full((48, 64), 255, np.uint8)) == 0
     visible = sequence.visible(0) > 0
     assert black.any() and visible.any() and not visible[black].any()

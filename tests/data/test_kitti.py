@@ -12,6 +12,7 @@ import pytest
 from thesis_repro import checks, odometry
 from thesis_repro.command import cli
 from thesis_repro.data import kitti, kitti_odometry, kitti_raw, layout, trajectories
+from thesis_repro.data.sequence import Sequence
 from thesis_repro.errors import InputError
 
 
@@ -19,7 +20,7 @@ def test_reads_a_sequence(tiny_kitti):
     # a temporary file of a killed run
     (tiny_kitti / "sequences/00/image_0/.000002.4711.png").write_bytes(b"half")
     assert kitti.sequences(tiny_kitti) == ["00"]
-    sequence = kitti.Sequence(tiny_kitti, "00")
+    sequence = Sequence(tiny_kitti, "00")
     assert len(sequence) == 4 and sequence.size == (48, 64) and len(list(sequence)) == 4
     assert np.array_equal(sequence.intrinsics, [[50, 0, 32], [0, 50, 24], [0, 0, 1]])
     assert np.array_equal(sequence.poses[:, 2, 3], [0, 1, 2, 3]) and sequence.times[-1] == 0.3
@@ -34,14 +35,14 @@ def test_reads_a_sequence(tiny_kitti):
 def test_colour_jpeg_frames_are_read_as_gray_with_the_colour_camera(tiny_kitti):
     calibration = tiny_kitti / "sequences/00/calib.txt"
     calibration.write_text(calibration.read_text() + "P2: 60 0 30 5 0 60 20 0 0 0 1 0\n")
-    before = kitti.Sequence(tiny_kitti, "00").frame(3)
+    before = Sequence(tiny_kitti, "00").frame(3)
     images = (tiny_kitti / "sequences/00/image_0").rename(tiny_kitti / "sequences/00/image_2")
     for path in images.glob("*.png"):
         cv2.imwrite(
             str(path.with_suffix(".JPG")), cv2.GaussianBlur(cv2.imread(str(path)), (0, 0), 2)
         )
         path.unlink()
-    sequence = kitti.Sequence(tiny_kitti, "0")  # "0" stands for "00"
+    sequence = Sequence(tiny_kitti, "0")  # "0" stands for "00"
     assert sequence.name == layout.locate(tiny_kitti, "0").name == "00" and kitti.sequences(
         tiny_kitti
     ) == ["00"]
@@ -54,18 +55,16 @@ def test_colour_jpeg_frames_are_read_as_gray_with_the_colour_camera(tiny_kitti):
 def test_without_ground_truth_steps_are_assumed(tiny_kitti):
     (tiny_kitti / "poses/00.txt").rename(tiny_kitti / "poses/away.txt")
     (tiny_kitti / "sequences/00/times.txt").write_text("0\n0.1\n0.3\n0.4\n")
-    sequence = kitti.Sequence(tiny_kitti, "00")
+    sequence = Sequence(tiny_kitti, "00")
     assert not sequence.has_truth and np.array_equal(sequence.scales, [0, 1, 1, 1])
     assert np.array_equal(odometry.start_pose(sequence), np.eye(4))
-    np.testing.assert_allclose(
-        kitti.Sequence(tiny_kitti, "00", speed=5).subset(3).scales, [0, 0.5, 1]
-    )
+    np.testing.assert_allclose(Sequence(tiny_kitti, "00", speed=5).subset(3).scales, [0, 0.5, 1])
     with pytest.raises(InputError, match="poses/00.txt"):
         sequence.poses  # noqa: B018
     (tiny_kitti / "sequences/00/times.txt").unlink()
-    assert np.allclose(kitti.Sequence(tiny_kitti, "00").times, [0, 0.1, 0.2, 0.3])
+    assert np.allclose(Sequence(tiny_kitti, "00").times, [0, 0.1, 0.2, 0.3])
     with pytest.raises(InputError, match=r"times.txt.*--fps"):
-        kitti.Sequence(tiny_kitti, "00", speed=5)
+        Sequence(tiny_kitti, "00", speed=5)
 
 
 def test_a_right_camera_has_poses_of_its_own(tiny_kitti):
@@ -73,28 +72,28 @@ def test_a_right_camera_has_poses_of_its_own(tiny_kitti):
     shutil.copytree(folder / "image_0", folder / "image_1")
     with open(folder / "calib.txt", "a") as file:
         file.write("P1: 50 0 32 -25 0 50 24 0 0 0 1 0\n")
-    left, right = kitti.Sequence(tiny_kitti, "00/"), kitti.Sequence(tiny_kitti, "0/", "image_1")
+    left, right = Sequence(tiny_kitti, "00/"), Sequence(tiny_kitti, "0/", "image_1")
     np.testing.assert_allclose(right.poses[:, :3, 3], left.poses[:, :3, 3] + [0.5, 0, 0])
 
 
 def test_frames_a_second_replace_a_missing_file_of_times(tiny_kitti):
     with pytest.raises(InputError, match="times.txt"):
-        kitti.Sequence(tiny_kitti, "00", fps=25)
+        Sequence(tiny_kitti, "00", fps=25)
     (tiny_kitti / "sequences/00/times.txt").unlink()
     (tiny_kitti / "poses/00.txt").unlink()
-    sequence = kitti.Sequence(tiny_kitti, "00", speed=5, fps=25)
+    sequence = Sequence(tiny_kitti, "00", speed=5, fps=25)
     np.testing.assert_allclose(sequence.times, [0, 0.04, 0.08, 0.12])
     np.testing.assert_allclose(sequence.scales, [0, 0.2, 0.2, 0.2])
     for fps in (0, -1, np.nan, np.inf):
         with pytest.raises(InputError, match="fps"):
-            kitti.Sequence(tiny_kitti, "00", fps=fps)
+            Sequence(tiny_kitti, "00", fps=fps)
 
 
 def test_a_folder_of_frames_needs_no_layout(tiny_kitti, tmp_path):
     folder = tmp_path / "mine"
     shutil.copytree(tiny_kitti / "sequences/00/image_0", folder)
     shutil.copy(tiny_kitti / "sequences/00/calib.txt", folder)
-    sequence = kitti.Sequence(None, folder)
+    sequence = Sequence(None, folder)
     assert (
         sequence.name == "mine"
         and len(sequence) == 4
@@ -102,10 +101,8 @@ def test_a_folder_of_frames_needs_no_layout(tiny_kitti, tmp_path):
         and not sequence.has_times
     )
     shutil.copy(tiny_kitti / "poses/00.txt", folder / "poses.txt")
-    assert np.array_equal(
-        kitti.Sequence(None, folder).poses, kitti.Sequence(tiny_kitti, "00").poses
-    )
-    official = kitti.Sequence(None, tiny_kitti / "sequences/00")
+    assert np.array_equal(Sequence(None, folder).poses, Sequence(tiny_kitti, "00").poses)
+    official = Sequence(None, tiny_kitti / "sequences/00")
     assert official.has_truth and official.name == "00"
 
 
@@ -117,7 +114,7 @@ def test_kittis_calibration_with_frames_of_another_size_is_refused(tiny_kitti, s
     for path in tiny_kitti.glob("sequences/00/image_0/*"):
         cv2.imwrite(str(path), np.zeros(size[::-1], np.uint8))
     with pytest.raises(InputError, match=rf"calib.txt.*1241x376.*{size[0]}x{size[1]}"):
-        kitti.Sequence(tiny_kitti, "00").frame(0)
+        Sequence(tiny_kitti, "00").frame(0)
 
 
 # Raw drives
@@ -153,7 +150,7 @@ def drive(tmp_path, tiny_kitti):
 
 
 def test_a_drive_has_poses_times_and_cameras(drive):
-    sequence = kitti.Sequence(None, drive)
+    sequence = Sequence(None, drive)
     assert (sequence.name, len(sequence), sequence.size) == (NAME, 4, (48, 64))
     np.testing.assert_allclose(sequence.times, [0, 0.1, 0.3, 0.4], atol=1e-9)
     assert np.array_equal(sequence.intrinsics, [[50, 0, 32], [0, 50, 24], [0, 0, 1]])
@@ -164,7 +161,7 @@ def test_a_drive_has_poses_times_and_cameras(drive):
     turn = cv2.Rodrigues(sequence.poses[3, :3, :3])[0][:, 0]
     np.testing.assert_allclose(turn, [np.pi / 2, 0, 0], atol=1e-9)
     np.testing.assert_allclose(sequence.poses[3, :3, 3], [0, -1.75, 1.25], atol=1e-9)
-    colour = kitti.Sequence(None, drive, camera="image_02")
+    colour = Sequence(None, drive, camera="image_02")
     assert colour.intrinsics[0, 0] == 60 and colour.frame_paths[0].parts[-3] == "image_02"
     assert np.array_equal(colour.poses, sequence.poses)
     assert set(sequence.files) >= {*drive.glob("oxts/data/*"), *drive.parent.glob("calib*")}
@@ -174,20 +171,20 @@ def test_a_folder_of_drives_is_a_root_and_a_link_a_sequence(drive, tiny_kitti):
     assert kitti.sequences(drive.parent) == [NAME]
     (tiny_kitti / "sequences/drive0001").symlink_to(drive)
     assert kitti.sequences(tiny_kitti) == ["00", "drive0001"]
-    expected = kitti.Sequence(None, drive)
+    expected = Sequence(None, drive)
     for root, name in ((drive.parent, NAME), (tiny_kitti, "drive0001")):
-        sequence = kitti.Sequence(root, name)
+        sequence = Sequence(root, name)
         assert sequence.name == name and np.array_equal(sequence.poses, expected.poses)
         assert checks.check_kitti(root) == []
     assert [folder for folder, *_ in cli._image_folders(drive.parent)] == [drive]
 
 
 def test_a_gps_without_a_lock_is_told(drive):
-    assert checks.sequence_warnings(kitti.Sequence(None, drive)) == []
+    assert checks.sequence_warnings(Sequence(None, drive)) == []
     path = drive / "oxts/data/0000000002.txt"
     numbers = path.read_text().split()
     path.write_text(" ".join([*numbers[:23], "9.5", *numbers[24:]]))
-    (line,) = checks.sequence_warnings(kitti.Sequence(None, drive))
+    (line,) = checks.sequence_warnings(Sequence(None, drive))
     assert "9.5 m" in line and path.name in line
 
 
@@ -208,7 +205,7 @@ def test_a_damaged_file_is_named(drive, file, text):
     if text is not None:
         (drive / file).write_bytes(text if isinstance(text, bytes) else text.encode())
     with pytest.raises(InputError, match=file.split("/")[-1]):
-        kitti.Sequence(None, drive)
+        Sequence(None, drive)
     assert any(file.split("/")[-1] in line for line in checks.check_kitti(drive.parent))
 
 
@@ -216,7 +213,7 @@ def test_a_damaged_file_is_named(drive, file, text):
 @pytest.mark.parametrize("number", ["0005", "0095"])
 def test_real_drives_agree_with_their_odometry_files(kitti_real, number):
     raw = kitti_real.parent / "kitti_raw"
-    sequence = kitti.Sequence(raw / "2011_09_26", f"2011_09_26_drive_{number}_sync")
+    sequence = Sequence(raw / "2011_09_26", f"2011_09_26_drive_{number}_sync")
     files = raw / f"sequences/drive{number}"
     # the file has seven digits of up to 46 m
     np.testing.assert_allclose(

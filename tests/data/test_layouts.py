@@ -11,6 +11,7 @@ from street import Street
 from thesis_repro import odometry
 from thesis_repro.command.cli import main
 from thesis_repro.data import kitti, layout, trajectories
+from thesis_repro.data.sequence import Sequence
 from thesis_repro.errors import InputError
 
 START = 1403636579.763555  # seconds since 1970
@@ -103,7 +104,7 @@ def write_all(root, drive):
 def check_equal_steps(root, drive):
     expected = None
     for name in LAYOUTS:
-        sequence = kitti.Sequence(None, root / name)
+        sequence = Sequence(None, root / name)
         np.testing.assert_allclose(np.diff(sequence.times), np.diff(drive.times), atol=1e-6)
         np.testing.assert_allclose(sequence.poses, drive.poses, atol=1e-6)
         assert np.array_equal(sequence.intrinsics, drive.intrinsics)
@@ -125,7 +126,7 @@ def test_the_same_drive_in_each_layout(street, tmp_path):
 @pytest.mark.real
 @pytest.mark.parametrize("name", ["06", "07"])
 def test_real_drives_in_each_layout(kitti_real, tmp_path, name):
-    real = kitti.Sequence(kitti_real, name).subset(30)
+    real = Sequence(kitti_real, name).subset(30)
     poses = np.linalg.inv(real.poses[0]) @ real.poses
     drive = Drive(real.frame_paths, real.intrinsics, real.times, poses)
     write_all(tmp_path, drive)
@@ -148,13 +149,13 @@ def test_a_body_becomes_the_camera_and_names_become_times(street, tmp_path):
     as_euroc(tmp_path / "euroc", street)
     frames = tmp_path / "euroc/mav0/cam0/data"
     camera, truth = frames.parent / "sensor.yaml", layout.poses(tmp_path / "euroc")
-    sequence = kitti.Sequence(None, frames, calibration=camera, truth=truth)
+    sequence = Sequence(None, frames, calibration=camera, truth=truth)
     np.testing.assert_allclose(sequence.poses, street.poses, atol=1e-6)
     camera.write_text(camera.read_text().replace("T_BS", "T_SB"))
-    with_body = kitti.Sequence(None, frames, calibration=camera, truth=truth)
+    with_body = Sequence(None, frames, calibration=camera, truth=truth)
     np.testing.assert_allclose(with_body.poses @ T_BS, street.poses, atol=1e-6)
     truth.rename(truth.with_name("away.csv"))
-    sequence = kitti.Sequence(None, frames, calibration=camera, speed=4.0, fps=20)
+    sequence = Sequence(None, frames, calibration=camera, speed=4.0, fps=20)
     np.testing.assert_allclose(sequence.scales[1:], 0.2)
 
 
@@ -166,9 +167,9 @@ def test_cameras_of_tum_are_known_by_the_name(street, tmp_path, number, fx):
     (folder / "calib.txt").unlink()
     if fx is None:
         with pytest.raises(InputError, match="calib.txt: .*--calibration"):
-            kitti.Sequence(None, folder)
+            Sequence(None, folder)
         return
-    sequence = kitti.Sequence(None, folder)
+    sequence = Sequence(None, folder)
     assert (sequence.intrinsics[0, 0], sequence.stated_size) == (fx, (480, 640))
     assert len(sequence.distortion) == (0 if number == "3" else 5)
 
@@ -176,7 +177,7 @@ def test_cameras_of_tum_are_known_by_the_name(street, tmp_path, number, fx):
 def test_another_folder_is_told_the_layouts(tmp_path):
     for folder in (tmp_path, tmp_path / "gone"):
         with pytest.raises(InputError) as told:
-            kitti.Sequence(None, folder)
+            Sequence(None, folder)
         assert all(known.LAYOUT in str(told.value) for known in layout.LAYOUTS)
 
 
@@ -185,4 +186,4 @@ def test_a_listed_frame_must_be_there(street, tmp_path):
     frame = sorted((tmp_path / "rgbd/rgb").iterdir())[3]
     frame.unlink()
     with pytest.raises(InputError, match=frame.name):
-        kitti.Sequence(None, tmp_path / "rgbd")
+        Sequence(None, tmp_path / "rgbd")

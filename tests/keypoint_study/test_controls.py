@@ -17,7 +17,7 @@ from thesis import section_4_2
 from thesis.ablations import boundaries
 from thesis_repro import masks
 from thesis_repro.data.cityscapes import ID
-from thesis_repro.data.kitti import Sequence
+from thesis_repro.data.sequence import Sequence
 from thesis_repro.masks import folders
 from thesis_repro.odometry import THESIS, keypoints
 from thesis_repro.odometry.loop import detect

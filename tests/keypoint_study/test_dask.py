@@ -15,7 +15,7 @@ from trials import ROOT, wait_for
 from keypoint_study import runner
 from keypoint_study.jobs import first_jobs, runs_of
 from keypoint_study.sources import Source
-from thesis_repro.data.kitti import Sequence
+from thesis_repro.data.sequence import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.running import workers
 

@@ -14,7 +14,7 @@ from keypoint_study.report import study_report as report
 from keypoint_study.sources import Source
 from thesis_repro import odometry
 from thesis_repro.command.cli import main
-from thesis_repro.data.kitti import Sequence
+from thesis_repro.data.sequence import Sequence
 from thesis_repro.data.trajectories import write_kitti_poses, write_tum
 from thesis_repro.errors import InputError
 from thesis_repro.odometry import metrics

@@ -14,7 +14,7 @@ from keypoint_study.jobs import Job, first_jobs, runs_of
 from keypoint_study.sources import Source
 from thesis import section_4_2, timing
 from thesis_repro import masks, odometry
-from thesis_repro.data.kitti import Sequence
+from thesis_repro.data.sequence import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.masks import folders
 from thesis_repro.odometry import metrics

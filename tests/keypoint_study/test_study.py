@@ -19,7 +19,7 @@ from keypoint_study.sources import Source
 from thesis_repro.command.cli import main
 from thesis_repro.data import label_ids
 from thesis_repro.data.cityscapes import ID, TRAINED
-from thesis_repro.data.kitti import Sequence
+from thesis_repro.data.sequence import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.masks.folders import LabelMasks, write_masks
 from thesis_repro.running.files import write_png

@@ -25,7 +25,7 @@ for copy in copies:
     sys.path.insert(0, str(copy))
     from keypoint_study import jobs, runner, worth_runs
     from keypoint_study.sources import Source
-    from thesis_repro.data.kitti import Sequence
+    from thesis_repro.data.sequence import Sequence
 
     sequence, source = Sequence(world / "kitti", "00").subset(3), Source(labels)
     shown = {"runs": runner._versions(runner.PATH, sequence)["code"]}

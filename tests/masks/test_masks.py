@@ -9,7 +9,7 @@ import pytest
 from thesis_repro import masks
 from thesis_repro.data.cameras import Camera
 from thesis_repro.data.cityscapes import ID, resize_bilinear
-from thesis_repro.data.kitti import Sequence
+from thesis_repro.data.sequence import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.masks import MaskSettings, folders
 from thesis_repro.running import provenance

@@ -11,7 +11,7 @@ import evidence
 import excerpts as command
 from thesis import checked, excerpts
 from thesis.settings import read_settings
-from thesis_repro.data.kitti import Sequence
+from thesis_repro.data.sequence import Sequence
 from thesis_repro.errors import InputError
 
 

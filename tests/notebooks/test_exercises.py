@@ -472,7 +472,7 @@ def ranges(*edits):
 def test_exercises_07_1_and_07_3(build):
     long = (
         "drives[SEQUENCE or min(drives)].subset(FRAMES)",
-        "earlier.kitti.Sequence(settings.kitti, '00')",
+        "earlier.Sequence(settings.kitti, '00')",
     )
     low, high = ranges(long)
     assert low.loc["500 keypoints", "RMSE (m)"] < high.loc["as above", "RMSE (m)"]  # they overlap

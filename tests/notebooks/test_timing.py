@@ -6,7 +6,7 @@ import pytest
 from keypoint_study.sources import Source
 from thesis import excerpts, timing
 from thesis.settings import ROOT, read_settings
-from thesis_repro.data.kitti import Sequence
+from thesis_repro.data.sequence import Sequence
 
 MEASURED = pd.DataFrame({"sequence": ["00"], "seconds": [0.25]})
 

@@ -14,7 +14,7 @@ from street import Street, Stripes
 
 from reference_steps import FOLDER, estimated, matched_points
 from thesis_repro import odometry
-from thesis_repro.data.kitti import Sequence
+from thesis_repro.data.sequence import Sequence
 from thesis_repro.data.trajectories import read_poses
 from thesis_repro.errors import InputError
 from thesis_repro.masks.folders import MaskFolder

@@ -13,7 +13,7 @@ import pytest
 
 import thesis_repro
 from reference_steps import ESTIMATORS, FOLDER, STEPS, digest
-from thesis_repro.data.kitti import Sequence
+from thesis_repro.data.sequence import Sequence
 from thesis_repro.masks.folders import MaskFolder
 from thesis_repro.odometry import THESIS, Matches, metrics, sharing
 from thesis_repro.odometry.loop import VoteOfAll, normalise

@@ -19,6 +19,7 @@ from street_world.things import Faces
 from thesis import ablations
 from thesis_repro.data import cityscapes, kitti
 from thesis_repro.data.cityscapes import ID
+from thesis_repro.data.sequence import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.odometry import OPENCV, THESIS
 
@@ -37,7 +38,7 @@ def out(tmp_path_factory):
 def test_layouts_are_read_by_the_readers_of_real_data(out):
     assert kitti.sequences(out / "kitti") == list(SMALL["sequences"])
     for name in SMALL["sequences"]:
-        sequence = kitti.Sequence(out / "kitti", name)
+        sequence = Sequence(out / "kitti", name)
         assert len(sequence) == SMALL["frames"]
         np.testing.assert_allclose(np.diff(sequence.times), 0.1, atol=1e-9)
         for index, frame in enumerate(sequence):

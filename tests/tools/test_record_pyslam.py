@@ -7,7 +7,7 @@ import pandas as pd
 from trials import ROOT, succeed
 
 from thesis_repro import odometry
-from thesis_repro.data.kitti import Sequence
+from thesis_repro.data.sequence import Sequence
 from thesis_repro.masks.folders import LabelMasks, MaskFolder
 from thesis_repro.running.files import write_png
 

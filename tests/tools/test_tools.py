@@ -14,7 +14,7 @@ import train_shipped
 from keypoint_study import jobs, runner, worth, worth_runs
 from keypoint_study.sources import Source
 from thesis.settings import read_settings
-from thesis_repro.data.kitti import Sequence
+from thesis_repro.data.sequence import Sequence
 from thesis_repro.segmentation import prediction
 
 pytestmark = pytest.mark.slow

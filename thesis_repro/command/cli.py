@@ -303,7 +303,7 @@ def _detector(options: Any) -> Any:
 
 
 def _sequence(options: Any) -> Any:
-    from thesis_repro.data.kitti import Sequence
+    from thesis_repro.data.sequence import Sequence
 
     names = "speed", "fps", "truth", "calibration", "truth_within"
     own = {name: vars(options)[name] for name in names if name in vars(options)}

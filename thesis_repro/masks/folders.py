@@ -13,7 +13,7 @@ from thesis_repro.data import label_ids
 from thesis_repro.data.cameras import Camera
 from thesis_repro.data.frames import say_once
 from thesis_repro.data.ids import LABEL_IDS
-from thesis_repro.data.kitti import Sequence, check_size
+from thesis_repro.data.sequence import Sequence, check_size
 from thesis_repro.errors import InputError
 from thesis_repro.masks import (
     THESIS_MASKS,

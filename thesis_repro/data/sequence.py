@@ -1,0 +1,313 @@
+"""A sequence: frames, camera, times and ground truth, in any of the layouts of `layout.LAYOUTS`."""
+
+import operator
+from collections.abc import Callable, Iterator
+from copy import copy
+from functools import cached_property, partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from thesis_repro.data import cameras, layout
+from thesis_repro.data.frames import eight_bits, say_once, times_in_names, white_level
+from thesis_repro.data.geometry import check_camera
+from thesis_repro.data.memory import FRAME_TIME, ArraySequence, distances, step_lengths
+from thesis_repro.data.trajectories import WITHIN, read_truth
+from thesis_repro.errors import InputError
+from thesis_repro.running import provenance
+from thesis_repro.running.files import read_gray, read_unchanged
+
+# Pixels near a border where keypoints are left out: half a window of the tracker, which would see
+# the border's edge
+BORDER_MARGIN = 10
+BORDER_SAMPLES, BLACK = 12, 8  # frames, and the largest gray value of a border
+
+
+class Sequence:
+    """A sequence in one of the layouts of `layout.LAYOUTS`, or a folder of own frames.
+
+    Frames are PNG or JPEG files. Colour frames are read as gray. Without a file of times, and
+    without times in the names of the frames, `times` assumes ten frames a second, as in KITTI.
+    Without a file of poses, `has_truth` is False. KITTI's ground truth belongs to the left gray
+    camera; the left colour camera is 6 cm beside it. The constructor reads and checks all files
+    except the frames. Raises InputError, naming the file, if a file is missing or malformed.
+
+    `Sequence.from_arrays(frames, intrinsics, ...)` is for frames in memory.
+    """
+
+    from_arrays = ArraySequence
+
+    def __init__(
+        self,
+        root: str | Path | None,
+        name: str | int | Path,
+        camera: str | None = None,
+        *,
+        speed: float | None = None,
+        fps: float | None = None,
+        truth: str | Path | None = None,
+        calibration: str | Path | None = None,
+        truth_within: float = WITHIN,
+    ) -> None:
+        """Find, read and check the files of a sequence, except its frames.
+
+        root: folder that holds sequences and poses. name: the sequence, "06", "6" or 6.
+        For a sequence outside of a root, root is None and name is a folder.
+        camera: one of the layout's, such as image_2; the default is the left one. speed: metres a
+        second, in place of ground truth; without both, a step is a metre. fps: frames a
+        second, for a sequence without a file of times. truth: file of the ground truth, in any form
+        that poses.txt may have. calibration: file of a camera, see `cameras.read_camera`; its
+        distortion is taken out of the frames. truth_within: seconds between a frame and its pose,
+        at most, if poses have times. Frames without a pose are left out.
+        """
+        self.folder = layout.locate(root, name)
+        self.name, self.speed = self.folder.name, speed
+        self.border: np.ndarray | None = None  # see `without_border`
+        files = layout.files(self.folder, camera)
+        own_calibration = files.calibration
+        if calibration is not None:
+            read_camera = partial(cameras.read_camera, name=files.camera)
+            files = files._replace(read_camera=read_camera, calibration=Path(calibration))
+        if truth is not None:
+            files = files._replace(read_poses=read_truth, poses=Path(truth))
+        self.frame_paths, self.doubts, self._others = files.frames, files.doubts, files.others
+        self.calibration_path = files.calibration
+        self.times_path, self.poses_path = files.times, files.poses
+        lens = files.read_camera(self.calibration_path)
+        self.lens = lens
+        self.intrinsics, self.distortion, self.stated_size = lens[:3]
+        self._body, self._body_path = lens.body, self.calibration_path
+        if lens.body is None:  # another calibration leaves T_BS as it is
+            self._body, self._body_path = cameras.read_body(own_calibration), own_calibration
+            self._others += (own_calibration,) if self._body is not None else ()
+        # whether somebody said what they are
+        self.has_times = self.times_path.exists() or fps is not None
+        self.times = self._read_times(files.read_times, fps)
+        self.usual_interval = float(np.median(np.diff(self.times))) if len(self) > 1 else 0.0
+        self.has_truth = truth is not None or (speed is None and self.poses_path.exists())
+        if self.has_truth:
+            times = self.times if self.has_times else None
+            indices, poses = files.read_poses(self.poses_path, times, truth_within)
+            self._take_truth(indices, poses, truth_within)
+        if speed is not None:
+            self._check_speed(speed)
+
+    def _read_times(self, read: Callable[[Path], np.ndarray], fps: float | None) -> np.ndarray:
+        path = self.times_path
+        if path.exists():
+            if fps is not None:
+                raise InputError(f"fps {fps:g}: leave it out; {path} has the times of the frames")
+            times = read(path)
+            check_count(path, len(times), self.frame_paths)
+            return times
+        if fps is not None:
+            if not 0 < fps < np.inf:
+                raise InputError(f"fps {fps:g}: must be a number of frames a second, above 0")
+            return np.arange(len(self)) / fps
+        named = times_in_names(self.frame_paths)
+        if named is not None:
+            self.has_times = True
+            say_once(
+                f"{self.folder}: the names of the frames are their times (--fps says otherwise)"
+            )
+            return named
+        say_once(
+            f"{path}: no such file, so {1 / FRAME_TIME:g} frames a second are assumed (--fps gives another "
+            "number)"
+        )
+        return FRAME_TIME * np.arange(len(self))
+
+    def _take_truth(self, indices: np.ndarray | None, poses: np.ndarray, within: float) -> None:
+        """Take poses of the frames with these indices, and leave out the others; None: all frames.
+
+        EuRoC's files (.csv) hold those of a body, others the camera's.
+        """
+        self._poses, path = poses, self.poses_path
+        if path.suffix == ".csv" and self._body is not None:
+            self._poses = poses @ self._body
+            say_once(f"{path}: poses of the body become the camera's by T_BS of {self._body_path}")
+        elif path.suffix == ".csv":
+            say_once(
+                f"{path}: holds poses of a body, which are taken as the camera's, because {self._body_path} "
+                "has no T_BS, the camera's pose in the body",
+                warns=True,
+            )
+        elif self._body is not None:
+            say_once(
+                f"{path}: poses are taken as the camera's; if they are those of the body that {self._body_path} "
+                "knows (T_BS), give EuRoC's .csv"
+            )
+        if indices is None:
+            check_count(path, len(poses), self.frame_paths)
+            return
+        inner = np.setdiff1d(np.arange(indices[0], indices[-1] + 1), indices)
+        line = f"{path}: has poses of {len(indices)} of {len(self)} frames, which are used"
+        if len(inner):
+            line += (
+                f"; {len(inner)} between them, the first one {self.frame_paths[inner[0]].name}, have none "
+                f"within {within:g} s"
+            )
+        if len(indices) < len(self):
+            say_once(line)
+        self.frame_paths = [self.frame_paths[index] for index in indices]
+        self.times = self.times[indices]
+
+    def _check_speed(self, speed: float) -> None:
+        if not 0 < speed < np.inf:
+            raise InputError(f"speed {speed:g}: must be a number of metres a second, above 0")
+        if self.has_truth:
+            raise InputError(
+                f"speed {speed}: leave it out; {self.poses_path} has the true step lengths"
+            )
+        if self.poses_path.exists():
+            say_once(f"{self.poses_path}: true poses are not used, because of the speed")
+        if not self.has_times:
+            raise InputError(
+                f"speed {speed}: needs the times of the frames (times.txt), or their number a second "
+                "(--fps)"
+            )
+
+    @property
+    def poses(self) -> np.ndarray:
+        """Ground truth: camera-to-world poses, (n, 4, 4), metres.
+
+        Raises InputError if there is none.
+        """
+        if not self.has_truth:
+            raise InputError(f"{self.poses_path}: no such file; ground truth is needed")
+        return self._poses
+
+    @property
+    def scales(self) -> np.ndarray:
+        """Distances between the true positions of consecutive frames, (n,), metres; the first is 0.
+
+        Without ground truth, they follow from the speed, or are 1.
+        """
+        if self.has_truth:
+            return distances(self.poses)
+        return step_lengths(self.times, self.speed)
+
+    @property
+    def files(self) -> list[Path]:
+        """All files of the sequence.
+
+        Frames and calibration, and the files of times and poses if they exist.
+        """
+        texts = self.calibration_path, self.times_path, self.poses_path
+        return [*self.frame_paths, *filter(Path.is_file, texts), *self._others]
+
+    def digest(self) -> str:
+        """What tells the sequence from others in a record of results."""
+        return provenance.digest_of_files(self.files)
+
+    @property
+    def label_names(self) -> list[str]:
+        """File names of label maps and masks: the names of the frames, with the ending .png."""
+        return [f"{path.stem}.png" for path in self.frame_paths]
+
+    def __len__(self) -> int:
+        return len(self.frame_paths)
+
+    @cached_property
+    def size(self) -> tuple[int, int]:
+        """Size (height, width) of the first frame. Raises InputError as `check_camera` does."""
+        first = self.frame_paths[0]
+        size = read_gray(first, np.uint16).shape
+        check_camera(self.calibration_path, self.intrinsics, first, size, self.stated_size)
+        return size
+
+    def frame(self, index: int) -> np.ndarray:
+        """Frame `index` as 8-bit gray, (height, width).
+
+        Raises InputError if it is unreadable or has another size.
+        """
+        path = self.frame_paths[index]
+        image = eight_bits(read_gray(path, np.uint16 if self._white else np.uint8), self._white)
+        check_size(path, image.shape, self.size)
+        return self.undistorted(image)
+
+    @cached_property
+    def _white(self) -> int:
+        return white_level(self.frame_paths[0])
+
+    def undistorted(self, image: np.ndarray) -> np.ndarray:
+        """Image of the frame's size without the camera's distortion; frames are so already."""
+        return cameras.undistorted(image, self.lens)
+
+    def __getitem__(self, index: int) -> np.ndarray:
+        if isinstance(index, slice):
+            raise InputError(
+                f"sequence {self.name}: takes no slice; subset(n) has the first n frames"
+            )
+        return self.frame(operator.index(index))
+
+    def __iter__(self) -> Iterator[np.ndarray]:
+        return map(self.frame, range(len(self)))
+
+    def visible(self, index: int) -> np.ndarray | None:
+        """Where keypoints may lie in frame `index`, (height, width) uint8: 255, elsewhere 0.
+
+        They lie neither in transparent parts, nor outside of what the camera saw if its distortion
+        is taken out, nor in the border (`without_border`), nor within BORDER_MARGIN pixels of
+        these. None: everywhere.
+        """
+        hidden = np.zeros(self.size, bool) if self.border is None else self.border.copy()
+        if self._has_alpha:
+            pixels = read_unchanged(self.frame_paths[index])
+            if pixels.ndim == 3 and pixels.shape[2] == 4:
+                hidden |= self.undistorted((pixels[..., 3] == 0).astype(np.uint8)) > 0
+        if self.distortion.any():
+            hidden |= self.undistorted(np.full(self.size, 255, np.uint8)) == 0
+        if not hidden.any():
+            return None
+        margin = np.ones([2 * BORDER_MARGIN + 1] * 2, np.uint8)
+        return 255 - cv2.dilate(hidden * np.uint8(255), margin)
+
+    @cached_property
+    def _has_alpha(self) -> bool:
+        pixels = read_unchanged(self.frame_paths[0])
+        return pixels.ndim == 3 and pixels.shape[2] == 4
+
+    def without_border(self) -> "Sequence":
+        """Copy without keypoints in parts that are black in all frames, nor close to them.
+
+        Undistortion leaves such borders. Raises InputError if there are none.
+        """
+        sample = np.unique(np.linspace(0, len(self) - 1, BORDER_SAMPLES).astype(int))
+        border = np.max([self.frame(index) for index in sample], axis=0) <= BLACK
+        if not border.any() or border.all():
+            raise InputError(f"{self.folder}: frames have no black border; do not leave it out")
+        bordered = copy(self)
+        bordered.border = border
+        return bordered
+
+    def subset(self, count: int | None) -> "Sequence":
+        """Copy of the sequence with its first `count` frames; None for all frames."""
+        short = copy(self)
+        short.frame_paths, short.times = self.frame_paths[:count], self.times[:count]
+        if self.has_truth:
+            short._poses = self._poses[:count]
+        return short
+
+
+def check_count(path: Path, count: int, frame_paths: list[Path]) -> None:
+    """Raise InputError unless a file has `count` lines for as many frames."""
+    if count != len(frame_paths):
+        raise InputError(
+            f"{path}: {count} lines for {len(frame_paths)} frames, {frame_paths[0].name} to "
+            f"{frame_paths[-1].name}; one line a frame is needed"
+        )
+
+
+def check_size(
+    path: Path, size: tuple[int, ...], expected: tuple[int, int], image: str = "the first frame"
+) -> None:
+    """Raise InputError if an image has another size than expected.
+
+    `image` names the image with the expected size.
+    """
+    if size != expected:
+        raise InputError(
+            f"{path}: {size[1]}x{size[0]} pixels; {image} has {expected[1]}x{expected[0]}"
+        )
