@@ -219,7 +219,7 @@ def worth_jobs(
     with_controls: bool = True,
     named: Collection[str] = (),
 ) -> list[Job]:
-    """Return the jobs of a study for `worth_runs.WORTH`, of one sequence after the other.
+    """Return the jobs of a study for `typical_worth.WORTH`, of one sequence after the other.
 
     numbers: of keypoints that are drawn, see `methods.with_numbers`. with_controls: also altered
     masks, and the controls of `mask_controls`; named: see there.

@@ -9,7 +9,7 @@ from typing import Any
 
 import pandas as pd
 
-from keypoint_study import comparisons, jobs, runner, sources, worth_runs
+from keypoint_study import comparisons, jobs, runner, sources, typical_worth
 from keypoint_study.sources import Source
 from thesis_repro.data.sequence import Sequence
 from thesis_repro.errors import InputError
@@ -171,14 +171,14 @@ class Study:
     def worths(
         self, folder: Path, processes: int = 1, scheduler: str | None = None
     ) -> pd.DataFrame | None:
-        """Return what a keypoint of each source is worth (`worth_runs.worths_of`), without truth.
+        """Return what a keypoint of each source is worth, without truth (`typical_worth`).
 
         What is in the folder is kept. None if no source has masks or keypoints. With a tested
         width, also of the controls.
         """
         if all(source.kind == "paths" for source in self.sources):
             return None
-        return worth_runs.worths_of(
+        return typical_worth.worths_of(
             self.opened,
             self.sources,
             self.shown_width,

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from keypoint_study import comparisons, jobs, ratios, runner, worth_runs
+from keypoint_study import comparisons, jobs, ratios, runner, typical_worth
 from keypoint_study.methods import EXPLORED, IN_PLACE, METHODS
 from keypoint_study.report import style, texts
 from keypoint_study.report import worths as report_worths
@@ -90,12 +90,12 @@ def write(settings, folder):
         ),
         "every second frame": lambda: runs_of_every_second(settings, sequences, labels),
         "their times": lambda: few_keypoints.time_steps(sequences[0], labels, few_folder),
-        "worth of a keypoint": lambda: worth_runs.worths_of(
+        "worth of a keypoint": lambda: typical_worth.worths_of(
             sequences,
             [Source(labels)],
             jobs.CONTROL_WIDTH,
             settings.build / "worth",
-            (worth_runs.DECIDING, 0, 200, 100),
+            (typical_worth.DECIDING, 0, 200, 100),
             processes=settings.jobs,
             named=tuple(EXPLORED),
         ),
@@ -270,9 +270,9 @@ def table_of_places(worths):
     of_masks = ["masked", "exact-boundaries", "mirrored"]
     shown = [titles[name] for name in (*of_masks, *IN_PLACE)]
     pairs = [*MIRRORED, *((name, f"beside-{name}") for name in of_masks)]
-    divided = [worth_runs.over(worths, titles[name], titles[other]) for name, other in pairs]
-    chosen = worths[worths["choice"].isin(shown) & (worths["number"] == worth_runs.DECIDING)]
-    decisive = [rows[rows["number"] == worth_runs.DECIDING] for rows in divided]
+    divided = [typical_worth.over(worths, titles[name], titles[other]) for name, other in pairs]
+    chosen = worths[worths["choice"].isin(shown) & (worths["number"] == typical_worth.DECIDING)]
+    decisive = [rows[rows["number"] == typical_worth.DECIDING] for rows in divided]
     return report_worths.table_of_worths(pd.concat([chosen, *decisive]), NEW_STREETS).content
 
 
@@ -286,7 +286,7 @@ def table_of_new_streets(worths):
     """Return the worths, by fields, on the streets that nothing was chosen on: one row each."""
     choices = ["random keypoints", "spread keypoints", "masks"]
     rows = worths[worths["sequence"].isin(NEW_STREETS) & worths["choice"].isin(choices)]
-    rows = rows[(rows["split"] == "fields") & (rows["number"] == worth_runs.DECIDING)]
+    rows = rows[(rows["split"] == "fields") & (rows["number"] == typical_worth.DECIDING)]
     columns = ["sequence", "choice", "keypoints", "direction", "rotation"]
     return rows[columns].round({"direction": 2, "rotation": 2}).sort_values(columns[:2])
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import pandas as pd
 
-from keypoint_study import comparisons, ratios, verdicts, worth_check, worth_runs
+from keypoint_study import comparisons, ratios, typical_worth, verdicts, worth_check
 from keypoint_study import worth as worths
 from keypoint_study.report import style, texts
 from keypoint_study.report import worths as report_worths
@@ -103,9 +103,10 @@ def worth(
     """
     rows = read_table(f"{REAL}worth_runs").query("number == @number")
     first, _, other = choice.partition(" / ")
-    rows = worth_runs.over(rows, first, other) if other else rows.query("choice == @choice")
+    rows = typical_worth.over(rows, first, other) if other else rows.query("choice == @choice")
     new = () if where else read_table(f"{REAL}new_streets")["sequence"]
-    (row,) = worth_runs.typical_worths(rows.query(where) if where else rows, new).to_dict("records")
+    rows = rows.query(where) if where else rows
+    (row,) = typical_worth.typical_worths(rows, new).to_dict("records")
     name = f"{motion}_{split}"
     ends = {end: row[f"{name}_{end}"] for end in ("low", "high", "below")}
     of_fit = row.get("verdict_of_fit")
@@ -129,9 +130,9 @@ def checks_off() -> list[str]:
 
 
 def new_streets_disagree(choice: str) -> bool:
-    """Whether the new streets disagree with the others on a choice (`worth_runs`)."""
+    """Whether the new streets disagree with the others on a choice (`typical_worth`)."""
     rows = read_table(f"{REAL}worth_runs").query("number == 400 and choice == @choice")
-    return worth_runs.new_disagree(rows, read_table(f"{REAL}new_streets")["sequence"])
+    return typical_worth.new_disagree(rows, read_table(f"{REAL}new_streets")["sequence"])
 
 
 def on_new_streets(choice: str, motion: str) -> str:

@@ -11,9 +11,9 @@ from keypoint_study import ratios, worth_check
 from keypoint_study.methods import DECIDING
 from keypoint_study.report import style, texts
 from keypoint_study.report.style import COLUMN_WIDTH, PAGE_WIDTH, Artefact
+from keypoint_study.typical_worth import typical_worths
 from keypoint_study.verdicts import LEVEL, MIN_SEQUENCES, NOT_JUDGED, TOO_FAR
 from keypoint_study.worth import FIELD, SPLIT
-from keypoint_study.worth_runs import typical_worths
 
 SHOWN = ("direction", "rotation")
 VERDICTS = ("a keypoint tells", "by one fit")  # columns of the table
@@ -24,7 +24,7 @@ DOT: dict[str, Any] = {"color": "#555555", "markersize": 4, "alpha": 0.45, "mark
 def table_of_worths(worths: pd.DataFrame, new: Collection[str] = ()) -> Artefact:
     """Return one row a choice and number, for readers: typical worths, intervals and the verdict.
 
-    worths: of `worth_runs.worths_of`. new: sequences, see `worth_runs.typical_worths`.
+    worths: of `typical_worth.worths_of`. new: sequences, see `typical_worth.typical_worths`.
     A cell says "0.51 (0.20-0.67), 7 of 8 below 1".
     """
     lines = []
@@ -86,7 +86,7 @@ def for_paper(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def cell(row: dict, name: str) -> str:
-    """Return a typical worth of `worth_runs.typical_worths` as text."""
+    """Return a typical worth of `typical_worth.typical_worths` as text."""
     ends = {end: row[f"{name}_{end}"] for end in ("low", "high")}
     return (
         f"{texts.short({'ratio': row[name], **ends})}, {row[f'{name}_below']} of {row['n']} below 1"

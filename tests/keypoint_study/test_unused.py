@@ -23,13 +23,13 @@ for copy in copies:
         continue
     os.chdir(copy)
     sys.path.insert(0, str(copy))
-    from keypoint_study import jobs, runner, worth_runs
+    from keypoint_study import jobs, runner, typical_worth
     from keypoint_study.sources import Source
     from thesis_repro.data.sequence import Sequence
 
     sequence, source = Sequence(world / "kitti", "00").subset(3), Source(labels)
     shown = {"runs": runner._versions(runner.PATH, sequence)["code"]}
-    shown["worth"] = runner._versions(worth_runs.WORTH, sequence)["code"]
+    shown["worth"] = runner._versions(typical_worth.WORTH, sequence)["code"]
     names = jobs.first_jobs([sequence], {"refined": (5,)}, tested=5)
     names.append(jobs.Job("00", "spread-anywhere", max_keypoints=100))
     for job, run in jobs.runs_of(names, [sequence], [source]).items():

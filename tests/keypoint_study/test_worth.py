@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 from street import Street
 
-from keypoint_study import verdicts, worth, worth_check, worth_runs
+from keypoint_study import typical_worth, verdicts, worth, worth_check
 from thesis_repro import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.odometry import OPENCV, THESIS
@@ -119,7 +119,7 @@ def test_verdicts_need_both_splits_and_both_motions():
     near_one = random.normal(0, 0.03, (8, 4))
 
     def verdict(logarithms):
-        (row,) = worth_runs.typical_worths(worths(logarithms)).itertuples()
+        (row,) = typical_worth.typical_worths(worths(logarithms)).itertuples()
         return row.verdict
 
     assert verdict(near_one) == verdicts.AS_MUCH
@@ -132,7 +132,7 @@ def test_verdicts_need_both_splits_and_both_motions():
     # the last two are new, and lie on the other side in one motion by fields
     more = np.concatenate([near_one + 0.7] * 3)
     more[-2:, 0] *= -0.1
-    told = [worth_runs.typical_worths(worths(more), new) for new in ([], ["22"], ["22", "23"])]
+    told = [typical_worth.typical_worths(worths(more), new) for new in ([], ["22"], ["22", "23"])]
     assert [each["verdict"][0] for each in told] == [
         verdicts.MORE,
         verdicts.MORE,
@@ -143,10 +143,10 @@ def test_verdicts_need_both_splits_and_both_motions():
 def test_no_word_is_said_where_the_check_found_the_measure_wrong(monkeypatch):
     less = worths(np.random.default_rng(0).normal(-0.7, 0.03, (8, 4)))
     off = [1.4, 1.6, np.nan]
-    monkeypatch.setattr(worth_runs, "factor_off", lambda *_: off[0])
+    monkeypatch.setattr(typical_worth, "factor_off", lambda *_: off[0])
     words = []
     while off:
-        (row,) = worth_runs.typical_worths(less).itertuples()
+        (row,) = typical_worth.typical_worths(less).itertuples()
         words.append(row.verdict)
         off.pop(0)
     assert words == [verdicts.LESS, verdicts.NOT_JUDGED, verdicts.LESS]
@@ -198,7 +198,7 @@ def test_error_rates_of_the_verdicts_by_chance(streets):
         spread = spread + random.normal(0, 0.3 * np.sqrt(0.5), (200, streets, 4))
         names = [f"{motion}_{split}" for split in worth.SPLIT for motion in worth.MOTIONS]
         studies = [pd.DataFrame(each + centre, columns=names) for each in spread]
-        return [worth_runs._verdict(dict(of_study.items())) for of_study in studies]
+        return [typical_worth._verdict(dict(of_study.items())) for of_study in studies]
 
     wrong = [each in (verdicts.LESS, verdicts.MORE) for each in words(0)]
     assert np.mean(wrong) < 0.03
@@ -262,7 +262,7 @@ def test_one_choice_is_divided_by_another():
         for choice, worth_of_choice in (("masks", 0.5), ("beside", 2.0))
     ]
     columns = ["sequence", "choice", "number", "split", "rotation", "direction"]
-    divided = worth_runs.over(pd.DataFrame(rows, columns=columns), "masks", "beside")
+    divided = typical_worth.over(pd.DataFrame(rows, columns=columns), "masks", "beside")
     assert list(divided["rotation"]) == list(divided["direction"]) == [0.25, 0.25]
     assert list(divided["sequence"]) == ["00", "01"] and divided["choice"].nunique() == 1
 

@@ -11,7 +11,7 @@ from executing import run_of
 import bench
 import evidence
 import train_shipped
-from keypoint_study import jobs, runner, worth, worth_runs
+from keypoint_study import jobs, runner, typical_worth, worth
 from keypoint_study.sources import Source
 from thesis.settings import read_settings
 from thesis_repro.data.sequence import Sequence
@@ -118,7 +118,7 @@ def test_a_street_gives_the_evidence_in_git(kitti_real, tmp_path, street):
         if job.method in ("drawn", "masked")
     ]
     measured = jobs.runs_of(asked, [sequence], [source])
-    worths = runner.run_all(measured, tmp_path / "worth", worth_runs.WORTH).table
+    worths = runner.run_all(measured, tmp_path / "worth", typical_worth.WORTH).table
     for name, made in ("runs", runs), ("worth_runs", worths):
         text = made.to_csv(index=False, lineterminator="\n", float_format="%.6g")
         whole = (evidence.FOLDER / f"{name}.csv").read_text(encoding="utf-8").splitlines()
