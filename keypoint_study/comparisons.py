@@ -1,11 +1,11 @@
 """The one table of comparisons, made from a table of runs.
 
 **Runs** (`runner.run_all`) have one row a run: sequence, run, source, method, dilation_width,
-estimator, repetition, frames, mean_keypoints, flagged, and one column for each of METRICS.
+estimator, repetition, frames, mean_keypoints, flagged, and one column for each of METRIC_TITLES.
 
 **Comparisons** (`comparisons_of`) have one row for each method, reference, metric and estimator:
 the ratio of the method's error to the reference's with its interval (`ratios`), a verdict
-(`verdicts.ERRORS`), on how many sequences each fails, and the ratio of every sequence. The rows
+(`verdicts.ERROR`), on how many sequences each fails, and the ratio of every sequence. The rows
 that answer the main question are those that `decide`.
 
 The functions below it select parts of a table of runs.
@@ -18,14 +18,14 @@ import numpy as np
 import pandas as pd
 
 from keypoint_study import methods, ratios, verdicts
-from keypoint_study.jobs import CONTROL_WIDTH, ESTIMATORS
+from keypoint_study.jobs import CONTROL_WIDTH, ESTIMATOR_TITLES
 from keypoint_study.methods import MASK_CONTROLS
 from keypoint_study.path_errors import ERRORS
 from keypoint_study.sources import UNMASKED
 from keypoint_study.verdicts import verdict
 
 # {name: title} of the methods and errors that are compared. The judging metrics decide.
-METHODS = {
+METHOD_TITLES = {
     name: method.title
     for name, method in methods.METHODS.items()
     if method.group != methods.THESIS_ONLY
@@ -34,7 +34,7 @@ SEGMENTATION_FREE_CONTROLS = [
     name for name, method in methods.METHODS.items() if method.group == methods.CONTROL
 ]
 BROUGHT = ("masked", *UNMASKED)  # methods of what a user brings; the others are controls
-METRICS = {name: error.title for name, error in ERRORS.items()}
+METRIC_TITLES = {name: error.title for name, error in ERRORS.items()}
 JUDGING_METRICS = {name: error.title for name, error in ERRORS.items() if error.decides}
 
 # of `comparisons_of`, before those of the sequences
@@ -87,9 +87,9 @@ def comparisons_of(runs: pd.DataFrame) -> pd.DataFrame:
     """
     runs = runs.assign(label=labels(runs))
     judging = judging_estimator(runs)
-    metrics = [name for name in METRICS if name in runs and runs[name].notna().any()]
+    metrics = [name for name in METRIC_TITLES if name in runs and runs[name].notna().any()]
     rows = []
-    for estimator in ESTIMATORS:
+    for estimator in ESTIMATOR_TITLES:
         variants = _variants(runs[runs["estimator"] == estimator], metrics)
         for (variant, errors), (reference, reference_errors) in product(variants, variants):
             if not _is_compared(variant, reference):
@@ -112,7 +112,7 @@ def comparisons_of(runs: pd.DataFrame) -> pd.DataFrame:
                     and estimator == judging,
                     "far_off": ratios.far_off(by_sequence),
                     **typical,
-                    "verdict": verdict(verdicts.ERRORS, typical["n"], [side]),
+                    "verdict": verdict(verdicts.ERROR, typical["n"], [side]),
                     **of_failures,
                     **by_sequence,
                 }
@@ -152,7 +152,7 @@ def verdict_of(rows: pd.DataFrame) -> str:
     """Return the verdict of several rows of `comparisons_of` together, such as both that decide."""
     sides = [ratios.side_of_one(low, high) for low, high in zip(rows["low"], rows["high"])]
     fewest = rows["n"].min() if len(rows) else 0
-    return verdict(verdicts.ERRORS, fewest, sides)
+    return verdict(verdicts.ERROR, fewest, sides)
 
 
 def _variants(
@@ -164,7 +164,7 @@ def _variants(
     errors, which are then found only once; under "failed", whether each run has failed.
     """
     variants = []
-    for method in METHODS:
+    for method in METHOD_TITLES:
         by_width = runs[runs["method"] == method].groupby(
             ["source", "dilation_width"], dropna=False, sort=False
         )
@@ -215,7 +215,7 @@ def labels(runs: pd.DataFrame) -> pd.Series:
     """
     width = runs["dilation_width"].where(runs["method"] == "masked")
     width = width.map(", width {:g}".format, na_action="ignore").astype(object).fillna("")
-    label = runs["method"].map(METHODS) + width
+    label = runs["method"].map(METHOD_TITLES) + width
     if len(sources(runs)) > 1:
         label = (runs["source"] + ": " + label).str.removeprefix(": ")  # all keypoints have none
     return label.mask(runs["method"].isin(UNMASKED), runs["source"])
@@ -231,7 +231,7 @@ def of_method(runs: pd.DataFrame, method: str, estimator: str | None = None) -> 
     """
     if estimator is None:
         were_run = set(runs["estimator"])
-        estimator = next((name for name in ESTIMATORS if name in were_run), "thesis")
+        estimator = next((name for name in ESTIMATOR_TITLES if name in were_run), "thesis")
     return runs[(runs["method"] == method) & (runs["estimator"] == estimator)]
 
 

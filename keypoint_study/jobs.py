@@ -37,7 +37,7 @@ from thesis_repro.errors import InputError
 from thesis_repro.odometry import THESIS, OdometrySettings, estimators
 
 # {name: title}
-ESTIMATORS = {name: estimator.title for name, estimator in estimators.ESTIMATORS.items()}
+ESTIMATOR_TITLES = {name: estimator.title for name, estimator in estimators.ESTIMATORS.items()}
 
 
 @dataclass(frozen=True)

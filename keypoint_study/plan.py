@@ -24,8 +24,8 @@ class Study:
     """One or several sources of masks, own keypoints or paths, compared with all keypoints.
 
     sequences: their names. widths: pixels, for masks from label maps. tested: width of the
-    controls, None for no controls. estimators: some of `jobs.ESTIMATORS`. frames: number of frames
-    of each sequence, None for all. scale_gate: metres, see OdometrySettings. masked_settings: other
+    controls, None for no controls. estimators: their names. frames: number of frames of each
+    sequence, None for all. scale_gate: metres, see OdometrySettings. masked_settings: other
     settings of the odometry, for all runs with masks. without_border: of Sequence. controls: those
     that not every study runs.
     """

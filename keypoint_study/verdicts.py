@@ -46,7 +46,7 @@ class Rule(NamedTuple):
 
 
 # of errors, divided by those with all keypoints or with other masks
-ERRORS = Rule(LOWER, HIGHER)
+ERROR = Rule(LOWER, HIGHER)
 # of shares of failed runs, by the sign test
 FAILURES = Rule(LOWER, HIGHER)
 # A word about a side can be right where a size is not, so it stands up to a factor of 1.5; AS_MUCH

@@ -37,7 +37,6 @@ from thesis_repro.odometry.refined.fit import ahead, refine, smaller_rotation
 from thesis_repro.odometry.runs import check, inside
 from thesis_repro.odometry.sharing import SharedCalls
 
-NUMBERS = (100, 200, 400)
 SPLITS, SEED = 12, 0  # splits of each kind
 FITS = 3  # draws for the measure of one fit
 FIELD = 2 * THESIS.window  # side of a field, pixels

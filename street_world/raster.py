@@ -38,7 +38,7 @@ TEXTURE, LABEL, GAIN = 15, 16, 17
 TRIANGLE = 18  # 1: s + t <= 1; 0: parallelogram
 GROUND = 19  # 1: part of the ground, which receives shadows; 0: a thing, which casts them
 LIT = 20  # 1: shaded by its outward normal (edge_s x edge_t); 0: shaded evenly, such as leaves
-COLUMNS = 21
+FACE_COLUMNS = 21
 
 # Columns of the coefficients: w s = c[S] + c[S_X] x + c[S_Y] y at sample (x, y); w t and w
 # likewise.
@@ -413,7 +413,7 @@ def render(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Render one view: an image before exposure and noise, and a label map.
 
-    The image is float32 (height, width), the label map uint8 of that shape. faces: (n, COLUMNS)
+    The image is float32 (height, width), the label map uint8 alike. faces: (n, FACE_COLUMNS)
     float64; pose: 4x4 camera-to-world; intrinsics: 3x3 in pixels whose centres have whole
     coordinates; size: (height, width).
     """

@@ -10,7 +10,7 @@ from collections.abc import Callable
 import numpy as np
 
 from street_world.drives import Track
-from street_world.raster import COLUMNS, CORNER, EDGE_S, EDGE_T, X, Y, Z
+from street_world.raster import CORNER, EDGE_S, EDGE_T, FACE_COLUMNS, X, Y, Z
 from street_world.textures import CAR_HEIGHT, CAR_PROFILE, FACADES, SIGNS, TILE, TREES
 from thesis_repro.data.cityscapes import ID
 
@@ -83,12 +83,12 @@ class Faces:
         self.add(*lid, texture, label, repeats, gain=gain)
 
     def matrix(self) -> np.ndarray:
-        """Return the faces added so far, (n, COLUMNS)."""
-        return np.array(self._rows, np.float64).reshape(-1, COLUMNS)
+        """Return the faces added so far, (n, FACE_COLUMNS)."""
+        return np.array(self._rows, np.float64).reshape(-1, FACE_COLUMNS)
 
 
 def place(faces: np.ndarray, x: float, z: float, yaw: float, y: float = 0.0) -> np.ndarray:
-    """Return local faces (n, COLUMNS) turned by yaw and moved to (x, y, z).
+    """Return local faces (n, FACE_COLUMNS) turned by yaw and moved to (x, y, z).
 
     yaw: radians to the right.
     """
@@ -116,7 +116,7 @@ def extrude(
     ground: int = 0,
     lit: int = 1,
 ) -> np.ndarray:
-    """Return the faces of a strip along a track, (n, COLUMNS).
+    """Return the faces of a strip along a track, (n, FACE_COLUMNS).
 
     The strip is a road, a sidewalk, a fence or a wall. s: (k,) evenly spaced places along the
     track; side: 1 right of it, -1 mirrored to its left; profile: cross-section, (distance from the

@@ -40,7 +40,7 @@ def runs(
         row |= {"failed": 0.0, "lost": 0, "mean_keypoints": 1900}
         if width:
             row["mean_keypoints"] = 500 + width
-        row |= dict.fromkeys(comparisons.METRICS, error)
+        row |= dict.fromkeys(comparisons.METRIC_TITLES, error)
         row["mae"] = error / 2
         rows.append(row)
     return pd.DataFrame(rows).astype({"dilation_width": float})

@@ -69,7 +69,7 @@ def test_texts_say_every_outcome_of_the_runs(with_masks, factor, streets, outcom
     with_masks(factor, streets)
     assert write_texts.verdict() == outcome
     readme, answer = map(write_texts.render, ("README.md.j2", "answer.md.j2"))
-    said = f"rrors with masks are {write_texts.ERRORS[outcome]} those with all keypoints"
+    said = f"rrors with masks are {write_texts.VERDICT_PHRASES[outcome]} those with all keypoints"
     assert said in readme and said in answer
 
 

@@ -26,9 +26,9 @@ from thesis_repro.running import program
 from thesis_repro.running.files import progress, write_png
 from thesis_repro.segmentation import prediction
 
-STREET, WIDTH, FEW = "drive0009", 10, 200
+STREET, WIDTH, FEW_SPREAD = "drive0009", 10, 200
 SEEDS = range(5)  # of the noise
-ERRORS = {"se3": "aligned ATE (m)", "rotation": "rotational RPE, 1 frame (deg)"}
+ERROR_TITLES = {"se3": "aligned ATE (m)", "rotation": "rotational RPE, 1 frame (deg)"}
 NOTE = "simulated: a gray level of noise in each pixel, five times, and poses of camera 0"
 
 
@@ -52,16 +52,16 @@ def errors_of(frames, camera, poses):
     runs = {}
     for estimator, options in (("thesis's", {}), ("refined", {"estimator": tr.refined})):
         every = tr.OdometrySettings(**options)
-        few = tr.OdometrySettings(detector=tr.spread(FEW), **options)
+        few = tr.OdometrySettings(detector=tr.spread(FEW_SPREAD), **options)
         runs[estimator, "all keypoints"] = every, None
         runs[estimator, f"masks, width {WIDTH}"] = every, masks
-        runs[estimator, f"{FEW} spread keypoints"] = few, None
+        runs[estimator, f"{FEW_SPREAD} spread keypoints"] = few, None
     sequence = tr.Sequence.from_arrays(frames, camera, poses=poses)
     rows = []
     for (estimator, keypoints), result in tr.run_many(sequence, runs).items():
         errors = path_errors(result.poses, poses)
         row = {"estimator": estimator, "keypoints": keypoints}
-        rows.append(row | {name: errors[name] for name in ERRORS})
+        rows.append(row | {name: errors[name] for name in ERROR_TITLES})
     return pd.DataFrame(rows).set_index(["estimator", "keypoints"])
 
 
@@ -69,7 +69,7 @@ def table_of(evidence, changed):
     """Return the errors of the evidence, and the lowest and highest of changed frames."""
     together = pd.concat(changed).groupby(level=[0, 1], sort=False)
     columns = {}
-    for name, title in ERRORS.items():
+    for name, title in ERROR_TITLES.items():
         spans = together[name].agg(["min", "max"])
         columns[title] = evidence[name].map("{:.4g}".format)
         columns[f"{title}, other bits"] = [

@@ -22,7 +22,7 @@ from thesis_repro.segmentation import prediction
 
 FOLDER = excerpts.FOLDER / "pictures"
 WIDTH = 10  # dilation width of masks, pixels
-FEW = 200  # spread keypoints
+FEW_SPREAD = 200  # spread keypoints
 DIMMED = 2  # times darker beside the mask
 STREET, FRAME = "05", 60  # of the first two pictures
 FAILS, FAIL_FRAME = "01", 30  # masks fail here
@@ -47,7 +47,7 @@ def street_and_masks(sequence, labels):
     frame, name = sequence.frame(FRAME), sequence.label_names[FRAME]
     label_map = read_label_map(labels / name)
     mask = tr.keypoint_mask(label_map, frame.shape, WIDTH)
-    everywhere, kept, few = detect(frame), detect(frame, mask=mask), tr.spread(FEW)(frame)
+    everywhere, kept, few = detect(frame), detect(frame, mask=mask), tr.spread(FEW_SPREAD)(frame)
     light = np.where(mask > 0, frame, frame // DIMMED)
     title = f"KITTI {sequence.name}, frame {FRAME}: all {len(everywhere)} keypoints"
     colors = style.label_colors(label_map, frame)

@@ -21,7 +21,7 @@ from thesis_repro.odometry.estimators import refined
 from thesis_repro.odometry.loop import normalise
 
 FOLDER = Path(__file__).parent.parent / "tests" / "reference"
-ESTIMATORS = {"thesis": THESIS, "refined": replace(THESIS, estimator=refined)}
+SETTINGS = {"thesis": THESIS, "refined": replace(THESIS, estimator=refined)}
 # {run: (its sequence, its first and its last recorded step, its keypoints in place of 2000)};
 # step n ends in frame n
 STEPS = {
@@ -37,7 +37,7 @@ STEPS = {
     "05_few": ("05", 129, 149, 500),  # the turn again; a shift to the side explains it as well
     "05_start": ("05", 1, 1, 300),  # a minimum that a second start leaves
 }
-FEW = (5, 6, 7, 8)  # points
+FEW_POINTS = (5, 6, 7, 8)  # points
 DECIMALS = 7  # of poses in a digest: different processors change them by up to 6e-14 m
 
 
@@ -80,7 +80,7 @@ def estimated(previous, current, camera):
 
 def steps(sequence, masks, first, last, count=2000):
     """Return one row for each step. The refined estimator knows nothing before the first one."""
-    follower = Odometry(sequence.intrinsics, replace(ESTIMATORS["refined"], max_keypoints=count))
+    follower = Odometry(sequence.intrinsics, replace(SETTINGS["refined"], max_keypoints=count))
     follower.step(sequence.frame(first - 1), mask=masks[first - 1])
     rows = []
     for index in range(first, last + 1):
@@ -105,7 +105,7 @@ def steps(sequence, masks, first, last, count=2000):
 def few_points(sequence):
     """Return steps of few points. Five of them have several essential matrices."""
     previous, current = matched_points(sequence.frame(0), sequence.frame(1))
-    slices = [slice(start, start + count) for count in FEW for start in range(0, 200, 50)]
+    slices = [slice(start, start + count) for count in FEW_POINTS for start in range(0, 200, 50)]
     return [estimated(previous[few], current[few], sequence.intrinsics) for few in slices]
 
 
@@ -139,7 +139,7 @@ def main(kitti, masks):
         write(run, rows, sequence.intrinsics)
         if len(wanted) > 2:
             continue
-        settings = {estimator: (value, folder) for estimator, value in ESTIMATORS.items()}
+        settings = {estimator: (value, folder) for estimator, value in SETTINGS.items()}
         for estimator, result in run_many(sequence, settings).items():
             paths.append((run, estimator, len(sequence), digest(result.poses)))
     street = Sequence(kitti, "00")

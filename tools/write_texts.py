@@ -30,7 +30,7 @@ WRITTEN |= {
 REAL = "kitti_excerpts/"  # tables on real frames
 WORLD = "odometry: embedded world, 11 drives of 25 frames; label maps by the model in the package"
 # how the texts say a verdict on errors
-ERRORS = {
+VERDICT_PHRASES = {
     verdicts.LOWER: "lower than",
     verdicts.HIGHER: "higher than",
     verdicts.NO_CLEAR_DIFFERENCE: "not clearly different from",
@@ -278,7 +278,7 @@ def with_interval(row: dict[str, Any]) -> str:
 def render(template: str) -> str:
     """Return the text that a template in docs/templates gives."""
     named = {function.__name__: function for function in FUNCTIONS}
-    return texts.render(template, **named, errors=ERRORS)
+    return texts.render(template, **named, errors=VERDICT_PHRASES)
 
 
 def book() -> str:

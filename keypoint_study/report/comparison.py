@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 
 from keypoint_study import best_width, comparisons, ratios
 from keypoint_study.comparisons import BROUGHT
-from keypoint_study.jobs import ESTIMATORS
+from keypoint_study.jobs import ESTIMATOR_TITLES
 from keypoint_study.path_errors import ERRORS
 from keypoint_study.report import style, texts
 from keypoint_study.report.style import BASELINE, COLUMN_WIDTH, MASKED, PAGE_WIDTH, Artefact
@@ -85,7 +85,7 @@ def figure_of_ratios(table: pd.DataFrame, source: str = "", width: float = PAGE_
         rows = rows[rows["estimator"] == comparisons.judging_estimator(rows)]
     sequences = comparisons.sequences_of(table)
     orders = {name: list(part["label"].unique()) for name, part in rows.groupby("estimator")}
-    estimators = [name for name in ESTIMATORS if name in orders]
+    estimators = [name for name in ESTIMATOR_TITLES if name in orders]
     metrics = [name for name in comparisons.JUDGING_METRICS if (rows["metric"] == name).any()]
     shown = list(product(estimators, metrics))
     columns, step = 1, 0.22  # inches from row to row
@@ -106,9 +106,9 @@ def figure_of_ratios(table: pd.DataFrame, source: str = "", width: float = PAGE_
     for panel, (estimator, metric) in zip(axes.flat, shown, strict=True):
         of_panel = rows[(rows["estimator"] == estimator) & (rows["metric"] == metric)]
         _draw_ratios(panel, of_panel, orders[estimator], sequences, reach)
-        panel.set_title(comparisons.METRICS[metric])
+        panel.set_title(comparisons.METRIC_TITLES[metric])
     for panel, (estimator, _) in zip(axes[:, 0], shown[::columns], strict=True):
-        panel.set_ylabel(ESTIMATORS[estimator])
+        panel.set_ylabel(ESTIMATOR_TITLES[estimator])
     for panel in axes[-1]:
         panel.set_xlabel(f"ratio to all keypoints{' (left of 1: lower)' * is_wide}", fontsize=8)
     return Artefact(name, title, caption, figure)
@@ -185,19 +185,19 @@ def table_of_ratios(rows: pd.DataFrame) -> pd.DataFrame:
     lines = []
     for _, pair in rows.groupby(keys, dropna=False, sort=False):
         first = pair.iloc[0]
-        over = comparisons.METHODS[first["reference"]]
+        over = comparisons.METHOD_TITLES[first["reference"]]
         if first["reference_source"] not in ("", first["source"]):
             over = f"{first['reference_source']}: {over}"
         judging = pair[pair["metric"].isin(comparisons.JUDGING_METRICS)]
         lines.append(
             {
-                "estimator": ESTIMATORS[first["estimator"]],
+                "estimator": ESTIMATOR_TITLES[first["estimator"]],
                 "keypoints": first["label"],
                 "number": first["keypoints"],
                 "over": over,
                 "sequences": pair["n"].max(),
                 **{
-                    comparisons.METRICS[row["metric"]]: texts.short(row)
+                    comparisons.METRIC_TITLES[row["metric"]]: texts.short(row)
                     for _, row in pair.iterrows()
                 },
                 "verdict": comparisons.verdict_of(judging),
@@ -241,17 +241,19 @@ def table_of_errors(table: pd.DataFrame, runs: pd.DataFrame) -> Artefact:
     standard deviation over the repetitions, "0.0103 ± 0.0021", if it is not 0. The lowest mean of a
     sequence is bold, as Markdown has it: "**0.0103 ± 0.0021**".
     """
-    labels = [comparisons.METHODS["baseline"], *_drawn(table)["label"].unique()]
+    labels = [comparisons.METHOD_TITLES["baseline"], *_drawn(table)["label"].unique()]
     runs = runs.assign(label=comparisons.labels(runs))
     parts = {}
-    for metric, estimator in product(comparisons.JUDGING_METRICS, ESTIMATORS):
+    for metric, estimator in product(comparisons.JUDGING_METRICS, ESTIMATOR_TITLES):
         rows = runs[runs["estimator"] == estimator].dropna(subset=[metric])
         errors = rows.groupby(["label", "sequence"])[metric]
         means = errors.mean().unstack().reindex(labels)
         cells = errors.agg(_mean_and_spread).unstack().reindex(labels)
         cells = cells.mask(means == means.min(), "**" + cells + "**")
         error = ERRORS[metric]
-        parts[f"{error.title} ({error.unit})", ESTIMATORS[estimator]] = cells.dropna(how="all")
+        parts[f"{error.title} ({error.unit})", ESTIMATOR_TITLES[estimator]] = cells.dropna(
+            how="all"
+        )
     shown = pd.concat(parts, names=["error", "estimator", "method"]).reset_index()
     return Artefact("errors", *CAPTIONS["errors"], shown)
 
@@ -296,7 +298,7 @@ def _widths(masked: pd.DataFrame, baseline: pd.DataFrame) -> pd.DataFrame:
         rows = best_width.of_chosen_width(masked, chosen[choice])
         for metric in metrics:
             by_sequence = ratios.ratios_of(rows, baseline, metric)
-            name = f"{label}: {comparisons.METRICS[metric]}"
+            name = f"{label}: {comparisons.METRIC_TITLES[metric]}"
             columns[name] = by_sequence
             failed[name] = ratios.count_failing(ratios.has_failed(rows.set_index("sequence")))
     columns["best width of one repetition, in the others: RMSE"] = stability["elsewhere"]

@@ -9,7 +9,7 @@ import pandas as pd
 
 from keypoint_study import best_width, comparisons, ratios, verdicts
 from keypoint_study.comparisons import BROUGHT
-from keypoint_study.jobs import CONTROL_WIDTH, ESTIMATORS
+from keypoint_study.jobs import CONTROL_WIDTH, ESTIMATOR_TITLES
 from keypoint_study.report import comparison, style, texts
 
 OUTCOMES = {
@@ -39,8 +39,8 @@ def findings_of(
             _result(label, pair, deciding) for label, pair in of_all.groupby("label", sort=False)
         ],
         embedded=embedded,
-        judge=ESTIMATORS[judge],
-        usual=ESTIMATORS[comparisons.USUAL_JUDGE],
+        judge=ESTIMATOR_TITLES[judge],
+        usual=ESTIMATOR_TITLES[comparisons.USUAL_JUDGE],
         more=more,
         data=data,
         frames=_frames(runs),
@@ -67,7 +67,7 @@ def _told(table: pd.DataFrame, judge: str) -> pd.DataFrame:
     is_pair = (table["reference"] == "masked") & (table["source"] < table["reference_source"])
     decides = table["estimator"] == judge
     rows = table[is_told & (is_over_all | decides & (is_over_control | is_pair))]
-    order = [*dict.fromkeys([judge, *ESTIMATORS])]
+    order = [*dict.fromkeys([judge, *ESTIMATOR_TITLES])]
     return comparison.all_of(rows).sort_values(
         "estimator", key=lambda names: names.map(order.index), kind="stable"
     )
@@ -85,7 +85,7 @@ def _result(label: str, pair: pd.DataFrame, deciding: pd.DataFrame) -> dict[str,
     without = []
     for _, row in pair[pair["far_off"].map(len) > 0].iterrows():
         left = ratios.typical_ratio(row[sequences].drop(row["far_off"]).dropna())
-        error = comparisons.METRICS[row["metric"]]
+        error = comparisons.METRIC_TITLES[row["metric"]]
         without.append(f"without {', '.join(row['far_off'])}, {error} is {texts.short(left)}")
     return {
         "title": label,
@@ -100,8 +100,8 @@ def _result(label: str, pair: pd.DataFrame, deciding: pd.DataFrame) -> dict[str,
 def _shuffles(runs: pd.DataFrame) -> pd.DataFrame:
     """Return how much shuffling changes the RMSE with all keypoints, one row an estimator."""
     factors = ratios.range_of_shuffles(runs).groupby("estimator")["factor"]
-    spread = factors.agg(["median", "max"]).reindex(list(ESTIMATORS)).dropna().round(3)
-    return spread.rename(index=ESTIMATORS, columns={"max": "highest"}).reset_index()
+    spread = factors.agg(["median", "max"]).reindex(list(ESTIMATOR_TITLES)).dropna().round(3)
+    return spread.rename(index=ESTIMATOR_TITLES, columns={"max": "highest"}).reset_index()
 
 
 def _stability(runs: pd.DataFrame) -> pd.DataFrame:

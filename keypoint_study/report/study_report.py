@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from keypoint_study import comparisons, runner
-from keypoint_study.jobs import ESTIMATORS
+from keypoint_study.jobs import ESTIMATOR_TITLES
 from keypoint_study.methods import CONTROL_WIDTH
 from keypoint_study.plan import RUNS, Study
 from keypoint_study.report import comparison, html, latex, style, worths
@@ -147,7 +147,7 @@ def write(
         warnings=warnings,
         embedded=embedded,
         kinds=KINDS,
-        estimators=ESTIMATORS,
+        estimators=ESTIMATOR_TITLES,
         line_width=CONTROL_WIDTH,
         changed=changed,
         widths=sorted(runs["dilation_width"].dropna().astype(int).unique()),
@@ -310,7 +310,7 @@ def figure_of_sequence(
     shown = {}
     poses = runner.run_poses(rows, folder / RUNS)
     for row in rows.itertuples():
-        label = row.source or comparisons.METHODS[row.method]
+        label = row.source or comparisons.METHOD_TITLES[row.method]
         shown[label] = metrics.shifted(poses[sequence.name, row.run], sequence.poses)
     return Artefact(
         f"paths-{sequence.name}",

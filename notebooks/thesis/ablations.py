@@ -22,13 +22,13 @@ from thesis_repro.masks import MaskSettings
 from thesis_repro.odometry import THESIS, metrics
 from thesis_repro.odometry.loop import detect, normalise, track
 
-ESTIMATORS = ("thesis", "inliers", "refined")  # a new one is compared when it is named here
+COMPARED = ("thesis", "inliers", "refined")  # a new one is compared when it is named here
 
 
 def run_ablations(
     sequences: list[Sequence], labels: Path, folder: Path, repetitions: int = 1, processes: int = 1
 ) -> pd.DataFrame:
-    """Run the ablations of `methods.METHODS` on every sequence with ESTIMATORS.
+    """Run the ablations of `methods.METHODS` on every sequence with COMPARED.
 
     labels: a folder with one folder of label maps a sequence. folder: for the results. The
     estimator "inliers" is run for all keypoints and masks alone.
@@ -38,7 +38,7 @@ def run_ablations(
     named = [Job(sequence.name, name) for sequence in sequences for name in compared_in(ABLATIONS)]
     jobs = [
         job
-        for job in repeated(named, ESTIMATORS, repetitions)
+        for job in repeated(named, COMPARED, repetitions)
         if job.estimator != "inliers" or job.method in ("baseline", "masked")
     ]
     table = run_all(runs_of(jobs, sequences, [Source(labels)]), folder, processes=processes).table

@@ -16,11 +16,11 @@ import pandas as pd
 from keypoint_study import comparisons, ratios
 
 ROWS = json.loads((Path(__file__).parent / "audit.json").read_text(encoding="utf-8"))["rows"]
-METRICS = {  # column of a table: its name in the audit
+CALLED = {  # column of a table: its name in the audit
     "rmse": "RMSE",
     "mae": "MAE",
     "mean_keypoints": "keypoints",
-    "rotation": comparisons.METRICS["rotation"],
+    "rotation": comparisons.METRIC_TITLES["rotation"],
     "in_turns": "rotation error in turns",
     "on_straights": "rotation error on straights",
     "se3": "aligned ATE",
@@ -31,7 +31,7 @@ METRICS = {  # column of a table: its name in the audit
     "rotation_deg_per_100m": "rotation error over 20 m",
 }
 TEXTS = ["quantity", "metric", "estimator", "unit", "data"]
-NUMBERS = ["quantity", "metric", "estimator", "value", "unit", "low", "high", "n", "frames", "data"]
+VALUES = ["quantity", "metric", "estimator", "value", "unit", "low", "high", "n", "frames", "data"]
 
 
 def measurement(
@@ -83,7 +83,7 @@ def audit_table(measurements: list[dict[str, Any]], data: str = "this run") -> p
     """
     headings = {"does": "the thesis or its code", "right": "what would be right"}
     words = pd.DataFrame(ROWS).rename(columns=headings)
-    numbers = pd.DataFrame(measurements).reindex(columns=["row", *NUMBERS])
+    numbers = pd.DataFrame(measurements).reindex(columns=["row", *VALUES])
     if unknown := set(numbers["row"]) - set(words["row"]):
         raise KeyError(*unknown)
     numbers = numbers.astype(dict.fromkeys(TEXTS, object)).fillna({"data": data})
@@ -109,6 +109,6 @@ def clear_effects(table: pd.DataFrame) -> pd.DataFrame:
 
     Row 14, a largest over a smallest error, cannot be below 1 and is left out.
     """
-    no_errors = ["", METRICS["mean_keypoints"], METRICS["fields"]]
+    no_errors = ["", CALLED["mean_keypoints"], CALLED["fields"]]
     lines = table[(table["unit"] == "ratio") & ~table["metric"].isin(no_errors)]
     return lines[((lines["low"] > 1) | (lines["high"] < 1)) & (lines["row"] != "14")]

@@ -141,7 +141,7 @@ def of_earlier_notebooks(settings: Settings, count: int) -> list[dict[str, Any]]
     for _, kind, _, share in found_again.itertuples():
         measurements.append(measurement("73", text, share, "%", metric=kind))
     quality = domain_gap.label_map_quality(settings.build)
-    for row in quality[quality["domain"] == domain_gap.FRAMES].itertuples() if len(quality) else ():
+    for row in quality[quality["domain"] == domain_gap.DRIVES].itertuples() if len(quality) else ():
         recall, frames = 100 * row.sky_recall, round(row.images / count)
         measurements.append(measurement("46", "recall of the sky", recall, "%", frames=frames))
     return measurements

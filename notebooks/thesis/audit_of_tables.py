@@ -14,7 +14,7 @@ from scipy.stats import binomtest
 
 from keypoint_study import comparisons, ratios
 from thesis import section_4_2
-from thesis.audit import METRICS, measurement, ratio, share
+from thesis.audit import CALLED, measurement, ratio, share
 from thesis.reported import REPORTED
 from thesis_repro.data.cityscapes import CLASS_WEIGHTS, ID, LABELS
 
@@ -27,13 +27,13 @@ CHANGES = pd.DataFrame(
 )
 WIDTHS_TRIED = 15  # dilation widths of the thesis, of which the best is reported
 WIDTHS = range(9, 12)  # the dilation widths that the thesis calls best
-FEW = 500  # keypoints that are "a few hundred" at most
+MANY = 500  # keypoints; more are not "a few hundred"
 # row 47
 TIME_TOGETHER = "change of the time of the odometry, all sequences together (Equation 4.2), mean of widths 9 to 11"
 TIME_TYPICAL = "time of the odometry with masks over that with all keypoints, widths 9 to 11"
 TIME_OF_NARROW = "time of the odometry with masks of the smallest width over that of the largest"
-ESTIMATORS = ("thesis", "refined")
-ERRORS = ("se3", "rotation")
+COMPARED = ("thesis", "refined")
+JUDGED = ("se3", "rotation")
 BOTH = ("rmse", "mean_keypoints")
 
 
@@ -43,7 +43,7 @@ def over(
     runs: pd.DataFrame,
     reference: pd.DataFrame,
     metrics: Iterable[str] = ("rmse",),
-    estimators: Iterable[str] = ESTIMATORS,
+    estimators: Iterable[str] = COMPARED,
 ) -> list[dict[str, Any]]:
     """Return the ratios of runs to reference runs, one for each metric and estimator.
 
@@ -55,7 +55,7 @@ def over(
         for estimator in [""] if metric == "mean_keypoints" else estimators:
             by_sequence = ratios.ratios_of(of(runs, estimator), of(reference, estimator), metric)
             lines.append(
-                ratio(row, quantity, by_sequence, metric=METRICS[metric], estimator=estimator)
+                ratio(row, quantity, by_sequence, metric=CALLED[metric], estimator=estimator)
             )
     return lines
 
@@ -63,14 +63,14 @@ def over(
 def over_thesis(row: str, quantity: str, runs: pd.DataFrame, estimator: str) -> dict[str, Any]:
     """Return the ratio of an estimator's RMSE to that of the thesis's estimator."""
     by_street = ratios.ratios_of(of(runs, estimator), of(runs, "thesis"), "rmse")
-    return ratio(row, quantity, by_street, metric=METRICS["rmse"], estimator=estimator)
+    return ratio(row, quantity, by_street, metric=CALLED["rmse"], estimator=estimator)
 
 
 def over_raw(quantity: str, runs: pd.DataFrame, metric: str) -> dict[str, Any]:
     """Return row 15's ratio of an error after an alignment to the RMSE of the same runs."""
     refined = of(runs, "refined")
     by_street = ratios.ratios_of(refined.assign(rmse=refined[metric]), refined, "rmse")
-    return ratio("15", quantity, by_street, metric=METRICS["rmse"], estimator="refined")
+    return ratio("15", quantity, by_street, metric=CALLED["rmse"], estimator="refined")
 
 
 def mean(
@@ -128,7 +128,7 @@ def of_reported() -> list[dict[str, Any]]:
         measurement("35", "sequences with a best width of 9 to 11", best_widths, "sequences"),
         measurement("60", "keypoints, means of Table 4.1", keypoints),
         measurement(
-            "60", f"sequences with more than {FEW} keypoints", sum(keypoints > FEW), "sequences"
+            "60", f"sequences with more than {MANY} keypoints", sum(keypoints > MANY), "sequences"
         ),
         measurement("18", "frames of 02 too few", 4661 - 4560, "frames"),
         measurement("18", "frames of 07 too few", 1101 - 1100, "frames"),
@@ -292,9 +292,9 @@ def of_ablations(runs: pd.DataFrame) -> list[dict[str, Any]]:
         over_thesis("29", "refined over thesis's estimator, masks", masks, "refined"),
         *(
             mean("29", "failed steps, all keypoints", every, "failed", "%", name)
-            for name in ESTIMATORS
+            for name in COMPARED
         ),
-        *(mean("29", "failed steps, masks", masks, "failed", "%", name) for name in ESTIMATORS),
+        *(mean("29", "failed steps, masks", masks, "failed", "%", name) for name in COMPARED),
         mean("30", to_the_right, every, "across", "degrees", "refined"),
         mean("30", below, every, "down", "degrees", "refined"),
         *over("34", "at most 100 keypoints over 2000", run("strongest-100"), every, BOTH),
@@ -302,7 +302,7 @@ def of_ablations(runs: pd.DataFrame) -> list[dict[str, Any]]:
         *over("34", "at most 400 keypoints over 2000", run("strongest-400"), every, BOTH),
         *(
             mean("34", "failed steps, 100 keypoints", run("strongest-100"), "failed", "%", name)
-            for name in ESTIMATORS
+            for name in COMPARED
         ),
         *over("42", "dropped afterwards over detected inside the mask", run("filter"), masks, BOTH),
         *over("48", "ORB over Shi-Tomasi", run("orb"), every, BOTH),
@@ -323,7 +323,7 @@ def _of_shuffles(runs: pd.DataFrame) -> list[dict[str, Any]]:
     """Return rows 14 and 97. Without a repetition there is no shuffled run."""
     if runs["repetition"].nunique() < 2:
         return []
-    spread = ratios.range_of_shuffles(runs[runs["estimator"].isin(ESTIMATORS)])
+    spread = ratios.range_of_shuffles(runs[runs["estimator"].isin(COMPARED)])
     text = "highest over lowest error of all keypoints, shuffled"
     lines = []
     for estimator, factors in spread.groupby("estimator")["factor"]:
@@ -338,8 +338,8 @@ def _of_parallax(text: str, name: str, runs: pd.DataFrame) -> list[dict[str, Any
     left, every = of_method(runs, name), of_method(runs, "baseline")
     as_many = of_method(runs, f"as many as {name}")
     return [
-        *over("56", f"{text}, over all", left, every, ("mean_keypoints", *ERRORS)),
-        *over("56", f"{text}, over as many at random", left, as_many, ERRORS),
+        *over("56", f"{text}, over all", left, every, ("mean_keypoints", *JUDGED)),
+        *over("56", f"{text}, over as many at random", left, as_many, JUDGED),
     ]
 
 

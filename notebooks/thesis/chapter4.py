@@ -32,7 +32,7 @@ from keypoint_study.report.style import (
 from thesis import frames
 from thesis.flicker import View
 
-METHODS = {
+DRAWN_METHODS = {
     "baseline": ("all keypoints", BASELINE),
     "masked": ("masked, best width", MASKED),
     "reduced": ("plainly reduced", REDUCED),
@@ -184,7 +184,7 @@ def _draw_paths(
             (above, drawn[:, 0], drawn[:, 2]),
             (below, along, distances[run.run]),
         ):
-            panel.plot(across, up, color=METHODS[run.method][1], **line)
+            panel.plot(across, up, color=DRAWN_METHODS[run.method][1], **line)
             if run.failed > 0 or run.lost > 0:
                 panel.plot(across[-1], up[-1], **FAILED)
     above.set_aspect("equal", adjustable="datalim")
@@ -265,16 +265,16 @@ def mark_failed(axes: plt.Axes, failed: pd.DataFrame) -> None:
 
 
 def bars(axes: plt.Axes, runs: pd.DataFrame, metric: str) -> None:
-    """Draw a bar for each method of METHODS and each sequence at the mean of a metric.
+    """Draw a bar for each method of DRAWN_METHODS and each sequence at the mean of a metric.
 
     Error bars go from the lowest to the highest repetition. runs: those of all methods.
     """
-    names = runs["method"].map({method: title for method, (title, _) in METHODS.items()})
+    names = runs["method"].map({method: title for method, (title, _) in DRAWN_METHODS.items()})
     by_method = runs.assign(any_failed=ratios.has_failed(runs)).groupby(["sequence", names])
     table = by_method[metric].agg(["mean", "min", "max"]).unstack("method")
     mean, failed = table["mean"], by_method["any_failed"].any().unstack("method")
     whiskers = np.stack([mean - table["min"], table["max"] - mean]).transpose(2, 0, 1)
-    colors = dict(METHODS.values())
+    colors = dict(DRAWN_METHODS.values())
     mean.plot.bar(
         ax=axes,
         yerr=np.where(whiskers > 0, whiskers, np.nan),

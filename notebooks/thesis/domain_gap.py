@@ -12,7 +12,7 @@ from thesis_repro.data.sequence import Sequence
 
 IMAGES = 100  # most images of a domain
 LABELLED_FRAMES = 50  # most frames of all drives together
-FRAMES = "the odometry's frames"  # the domain for which masks are made
+DRIVES = "the odometry's frames"  # the domain for which masks are made
 # a model and a domain with images that are in the model's training data
 SEEN = ("the model in the package", "KITTI's street scenes")
 RECORD = "quality"  # name of the table in the build folder with the scores of all models
@@ -95,5 +95,5 @@ def label_map_quality(build: Path) -> pd.DataFrame:
     if not path.is_file():
         return pd.DataFrame()
     used = pd.read_csv(path).query("used")
-    used = used.sort_values("domain", key=lambda names: names != FRAMES, kind="stable")
+    used = used.sort_values("domain", key=lambda names: names != DRIVES, kind="stable")
     return used.assign(seen=(used["model"] == SEEN[0]) & (used["domain"] == SEEN[1]))

@@ -1,7 +1,7 @@
 """Choices of keypoints at an equal number, and what each verdict hangs on.
 
 A mask leaves fewer keypoints than the detector finds. Here as many are compared, from the runs of
-`few_keypoints`. A verdict on both deciding errors (`verdicts.ERRORS`) is then asked again: without
+`few_keypoints`. A verdict on both deciding errors (`verdicts.ERROR`) is then asked again: without
 each street, each two and each day, without the streets on which something was chosen, and with
 Student's t in place of the signed rank. One that stays everywhere hangs on none of them.
 """
@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 
 from keypoint_study import comparisons, ratios
 from keypoint_study.report import style, texts
-from keypoint_study.verdicts import ERRORS, verdict
+from keypoint_study.verdicts import ERROR, verdict
 
 DECIDING = comparisons.JUDGING_METRICS
 SHOWN = {"thesis": "thesis's estimator", "refined": "refined estimator"}
@@ -75,7 +75,7 @@ def word(of_streets: pd.DataFrame, ends: tuple[str, str] = ("low", "high")) -> s
     """Return the verdict on both errors. ends: of the interval, in `ratios.typical_ratio`."""
     typical = [ratios.typical_ratio(of_streets[name]) for name in DECIDING]
     sides = [ratios.side_of_one(*(each[end] for end in ends)) for each in typical]
-    return verdict(ERRORS, len(of_streets), sides)
+    return verdict(ERROR, len(of_streets), sides)
 
 
 def hangs_on(of_streets: pd.DataFrame, new: Collection[str]) -> dict[str, Any]:

@@ -30,7 +30,7 @@ from thesis_repro import odometry
 from thesis_repro.data.sequence import Sequence
 from thesis_repro.running import provenance
 
-ESTIMATORS = {name: jobs.ESTIMATORS[name] for name in ("thesis", "refined")}  # of the verdict
+COMPARED = {name: jobs.ESTIMATOR_TITLES[name] for name in ("thesis", "refined")}  # of the verdict
 NUMBERS = (50, 100, 200, 400, 800)
 REPETITIONS = 4  # three of them with the matched points shuffled
 TIMED_RUNS = 5
@@ -44,7 +44,6 @@ LABELS = {CALLED.get(name, name): METHODS[name].title for name in compared_in(FE
     "random-on": "random ones on the mask",
     "filled": f"mask, filled to {FILL} a field",
 }
-ERRORS = comparisons.JUDGING_METRICS
 COLUMNS = (
     "sequence",
     "choice",
@@ -104,7 +103,7 @@ def run_few(
         for key, job in jobs_of(sequence, numbers).items()
         if not only or key in only
     ]
-    runs = runs_of(repeated(listed, ESTIMATORS, repetitions), sequences, [Source(labels)])
+    runs = runs_of(repeated(listed, COMPARED, repetitions), sequences, [Source(labels)])
     table = run_all(runs, folder, processes=processes).table
     return table.assign(
         choice=table["method"].replace(CALLED),
@@ -152,7 +151,7 @@ def ratios_to_all(runs: pd.DataFrame) -> pd.DataFrame:
         for estimator, of_estimator in chosen.groupby("estimator", sort=False):
             of_all = reference[reference["estimator"] == estimator]
             failed = of_estimator.set_index("sequence")["failed"] > 0
-            for error in ERRORS:
+            for error in comparisons.JUDGING_METRICS:
                 numbers = ratios.typical_ratio(ratios.ratios_of(of_estimator, of_all, error))
                 row = {
                     "choice": choice,
@@ -171,16 +170,16 @@ def ratios_to_all(runs: pd.DataFrame) -> pd.DataFrame:
 def verdict_on(chosen: pd.DataFrame, reference: pd.DataFrame) -> str:
     """Return the verdict on some runs, compared with those of all keypoints.
 
-    Both have the columns sequence, estimator, failed, and those of ERRORS.
+    Both have the columns sequence, estimator, failed, and those of comparisons.JUDGING_METRICS.
     """
     narrow, fails_more, counts = [], False, []
-    for estimator in ESTIMATORS:
+    for estimator in COMPARED:
         arms = [rows[rows["estimator"] == estimator] for rows in (chosen, reference)]
         failing = [
             ratios.failing_sequences(rows.set_index("sequence")["failed"] > 0) for rows in arms
         ]
         fails_more |= failing[0] > failing[1]
-        for error in ERRORS:
+        for error in comparisons.JUDGING_METRICS:
             of_streets = ratios.ratios_of(arms[0], arms[1], error)
             counts.append(len(of_streets))
             narrow.append((error, *ratios.narrow_interval(of_streets)))
@@ -196,10 +195,10 @@ def table_of_few(rows: pd.DataFrame, times: pd.DataFrame | None = None) -> pd.Da
         mean = chosen["keypoints"].iloc[0]
         line: dict[str, Any] = {"keypoints": f"{mean:.0f}", "how chosen": LABELS[choice]}
         for row in chosen.to_dict("records"):
-            name = f"{ERRORS[row['error']]}, {ESTIMATORS[row['estimator']]}"
+            name = f"{comparisons.JUDGING_METRICS[row['error']]}, {COMPARED[row['estimator']]}"
             line[name] = f"{texts.short(row)}, {row['above']} of {row['n']}"
         for row in chosen.drop_duplicates("estimator").itertuples():
-            line[f"sequences that fail, {ESTIMATORS[row.estimator]}"] = row.failed
+            line[f"sequences that fail, {COMPARED[row.estimator]}"] = row.failed
         if times is not None:
             line["CPU time a frame (ms)"] = milliseconds.get((choice, number))
         lines.append(line | {"verdict": chosen["verdict"].iloc[0]})
@@ -214,14 +213,14 @@ def figure_of_few(rows: pd.DataFrame) -> Figure:
     """
     of_few = rows[rows["choice"] != "all"]
     enlarged = (False, True) if of_few["ratio"].between(*NEAR).mean() > 0.5 else (False,)
-    scales = list(product(ERRORS, enlarged))
+    scales = list(product(comparisons.JUDGING_METRICS, enlarged))
     height = 1 + 2 * len(scales)
-    drawing, panels = style.new_figure(len(scales), len(ESTIMATORS), sharex=True, height=height)
+    drawing, panels = style.new_figure(len(scales), len(COMPARED), sharex=True, height=height)
     for (error, near), panel_row in zip(scales, panels, strict=True):
-        for panel, estimator in zip(panel_row, ESTIMATORS, strict=True):
+        for panel, estimator in zip(panel_row, COMPARED, strict=True):
             shown = rows[(rows["error"] == error) & (rows["estimator"] == estimator)]
             _draw_curves(panel, shown, near)
-            title = f"{comparisons.METRICS[error]}, {ESTIMATORS[estimator]}"
+            title = f"{comparisons.METRIC_TITLES[error]}, {COMPARED[estimator]}"
             panel.set_title(f"the same, {NEAR[0]} to {NEAR[1]}" if near else title)
             if not near:
                 style.ratio_axis(panel.yaxis, rows[["ratio", "low", "high"]].to_numpy())

@@ -11,11 +11,11 @@ from thesis_repro.running import provenance
 from thesis_repro.running.files import listed
 
 TABLE = ROOT / "figures" / "trainings.csv"
-NUMBERS = {  # columns of the table: their names in `table_of_trainings`
+COLUMN_TITLES = {  # columns of the table: their names in `table_of_trainings`
     "keypoints": "keypoints with masks",
     "mean_iou": "mean IoU of the label maps",
-    "se3_ratio": f"ratio of the {comparisons.METRICS['se3']}",
-    "rotation_ratio": f"ratio of the {comparisons.METRICS['rotation']}",
+    "se3_ratio": f"ratio of the {comparisons.METRIC_TITLES['se3']}",
+    "rotation_ratio": f"ratio of the {comparisons.METRIC_TITLES['rotation']}",
     "rmse_ratio": "ratio of the RMSE",
     "table_4_2_mean": "mean of Table 4.2 (%), best of 15 widths",
     "table_4_2_improved": "sequences improved in Table 4.2",
@@ -35,12 +35,12 @@ def table_of_trainings() -> pd.DataFrame:
     """
     parts = {}
     for estimator, rows in read().groupby("estimator", sort=False):
-        numbers = rows[[name for name in NUMBERS if rows[name].notna().all()]]
+        numbers = rows[[name for name in COLUMN_TITLES if rows[name].notna().all()]]
         table = numbers.agg(["min", "median", "max"]).T.round(2).astype(object)
-        table = table.rename(NUMBERS)
+        table = table.rename(COLUMN_TITLES)
         counts = rows["verdict"].value_counts().items()
         table.loc["verdict"] = [", ".join(f"{count} {name}" for name, count in counts), "", ""]
-        parts[jobs.ESTIMATORS[str(estimator)]] = table[["min", "median", "max"]]
+        parts[jobs.ESTIMATOR_TITLES[str(estimator)]] = table[["min", "median", "max"]]
     table = pd.concat(parts, names=["estimator", "number"]).reset_index()
     return table.rename(columns={"min": "lowest", "max": "highest"})
 

@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 
 from keypoint_study import ratios, verdicts
-from keypoint_study.verdicts import ERRORS, FAILURES, FEW_KEYPOINTS, WORTH, verdict
+from keypoint_study.verdicts import ERROR, FAILURES, FEW_KEYPOINTS, WORTH, verdict
 
 INSIDE = [("se3", 0.81, 1.24), ("rotation", 0.92, 1.09)]
 BETTER = [("se3", 0.5, 1.24), ("rotation", 0.92, 0.95)]
@@ -15,10 +15,10 @@ ALIKE = [("rotation", 0.81, 1.24), ("direction", 0.9, 1.1)]
 @pytest.mark.parametrize(
     "rule, outcome, word",
     [
-        (ERRORS, {"sides": [-1, -1]}, "lower"),
-        (ERRORS, {"sides": [1]}, "higher"),
-        (ERRORS, {"sides": [1, -1]}, "no clear difference"),
-        (ERRORS, {"sides": [-1, 0]}, "no clear difference"),
+        (ERROR, {"sides": [-1, -1]}, "lower"),
+        (ERROR, {"sides": [1]}, "higher"),
+        (ERROR, {"sides": [1, -1]}, "no clear difference"),
+        (ERROR, {"sides": [-1, 0]}, "no clear difference"),
         (FAILURES, {"sides": [1]}, "higher"),
         (WORTH, {"sides": [-1] * 4, "narrow": ALIKE}, "less"),
         (WORTH, {"sides": [1] * 4}, "more"),

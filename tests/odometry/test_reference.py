@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 
 import thesis_repro
-from reference_steps import ESTIMATORS, FOLDER, STEPS, digest
+from reference_steps import FOLDER, SETTINGS, STEPS, digest
 from thesis_repro.data.sequence import Sequence
 from thesis_repro.masks.folders import MaskFolder
 from thesis_repro.odometry import THESIS, Matches, metrics, sharing
@@ -118,6 +118,6 @@ def test_whole_paths_have_the_recorded_digests(kitti_real, reference, runs):
         sequence, masks = Sequence(kitti_real, run[:2]), None
         if "masked" in run:
             masks = MaskFolder(reference / "masks_00", sequence)
-        settings = {estimator: (value, masks) for estimator, value in ESTIMATORS.items()}
+        settings = {estimator: (value, masks) for estimator, value in SETTINGS.items()}
         for estimator, result in thesis_repro.run_many(sequence, settings).items():
             assert digest(result.poses) == expected[run, estimator], (run, estimator)

@@ -206,7 +206,7 @@ COMMANDS = {
 
 
 # {error of `metrics.errors`: its name in a record}
-ERRORS = {
+RECORD_NAMES = {
     "rmse": "rmse_m",
     "mae": "mae_m",
     "se3": "ate_se3_m",
@@ -229,7 +229,7 @@ def _record(result: Any, sequence: Any) -> dict[str, Any]:
     return {
         "sequence": sequence.name,
         "frames": len(sequence),
-        **{name: known.get(error) for error, name in ERRORS.items()},
+        **{name: known.get(error) for error, name in RECORD_NAMES.items()},
         # no frame may have structure
         "mean_keypoints": float(detected.mean()) if len(detected) else 0.0,
         "ms_per_frame": 1000 * float(seconds.mean()),

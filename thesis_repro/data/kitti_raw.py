@@ -20,7 +20,7 @@ from thesis_repro.running.files import listed
 LAYOUT = "a raw drive of KITTI (image_00/data, oxts/data)"
 # left gray, left colour, then the right ones; frames and time stamps lie in them
 IMAGE_FOLDERS = ("image_00", "image_02", "image_01", "image_03")
-FRAMES, TIMES, OXTS = "data", "timestamps.txt", "oxts/data"
+FRAMES_FOLDER, TIMES, OXTS = "data", "timestamps.txt", "oxts/data"
 EARTH_RADIUS = 6378137.0  # metres
 ACCURACY, MAX_ACCURACY = 23, 1.0  # column of the GPS's error, and metres that are too many
 
@@ -37,10 +37,10 @@ def poses(folder: Path) -> Path:
 
 def files(folder: Path, camera: str | None) -> Files:
     """Files of a drive. camera: one of IMAGE_FOLDERS."""
-    image_folder = camera_folder(folder, IMAGE_FOLDERS, camera, FRAMES)
+    image_folder = camera_folder(folder, IMAGE_FOLDERS, camera, FRAMES_FOLDER)
     if image_folder is None:
         raise InputError(
-            f"{folder}: must hold {IMAGE_FOLDERS[0]}/{FRAMES} or {IMAGE_FOLDERS[1]}/{FRAMES}"
+            f"{folder}: must hold {IMAGE_FOLDERS[0]}/{FRAMES_FOLDER} or {IMAGE_FOLDERS[1]}/{FRAMES_FOLDER}"
         )
     key = f"P_rect_{image_folder.parent.name[-2:]}"
     used = [calibration(folder, name) for name in ("imu_to_velo", "velo_to_cam")]

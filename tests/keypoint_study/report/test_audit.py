@@ -73,7 +73,7 @@ def test_ablations_become_ratios_of_their_reference():
         [f"{number:02d}" for number in range(8)],
         lambda _, method, __: factors[method],
         dict.fromkeys(factors, [None]),
-        estimators=ablations.ESTIMATORS,
+        estimators=ablations.COMPARED,
         noise=0.02,
     )
     runs = runs.assign(failed=1.0, across=0.1, down=0.2, sim3=runs["rmse"])

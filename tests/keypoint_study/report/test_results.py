@@ -19,7 +19,7 @@ from matplotlib.font_manager import FontProperties
 from matplotlib.textpath import TextPath
 
 from keypoint_study import comparisons, ratios, verdicts
-from keypoint_study.jobs import ESTIMATORS
+from keypoint_study.jobs import ESTIMATOR_TITLES
 from keypoint_study.report import comparison, findings, html, latex, style, texts
 from thesis import chapter4, few_keypoints, frames, section_4_2
 from thesis.reported import REPORTED
@@ -125,7 +125,7 @@ def test_errors_are_means_with_their_spread_and_the_lowest_is_bold():
     methods = [
         "all keypoints",
         "masks, width 10",
-        *(comparisons.METHODS[name] for name in CONTROLS),
+        *(comparisons.METHOD_TITLES[name] for name in CONTROLS),
     ]
     assert list(table["method"]) == 4 * methods and list(table.columns[3:]) == ELEVEN
     assert list(table["estimator"].unique()) == ["thesis's estimator", "refined estimator"]
@@ -240,9 +240,9 @@ def test_ratios_in_the_tables_equal_the_comparison():
     of_rmse = table[table["tested"] & (table["method"] != "baseline") & (table["metric"] == "rmse")]
     for row in of_rmse[of_rmse["reference"] == "baseline"].itertuples():
         cell = shown[
-            (shown["estimator"] == ESTIMATORS[row.estimator])
+            (shown["estimator"] == ESTIMATOR_TITLES[row.estimator])
             & (shown["over"] == "all keypoints")
-            & shown["keypoints"].str.startswith(comparisons.METHODS[row.method])
+            & shown["keypoints"].str.startswith(comparisons.METHOD_TITLES[row.method])
         ]["RMSE"].iloc[0]
         ratio, low, high = map(float, re.findall(r"[\d.]+", cell))
         assert (ratio, low, high) == pytest.approx((row.ratio, row.low, row.high), abs=0.0051)
@@ -369,8 +369,8 @@ def test_the_curve_of_few_keypoints_shows_every_ratio():
         {"choice": choice, "number": number, "keypoints": number or 1900, "estimator": estimator}
         | {"error": error, "ratio": 2.0, "low": 0.3, "high": 90.0 if number == 50 else 3.0}
         for choice, number in (("all", 0), ("strongest", 50), ("strongest", 400))
-        for estimator in few_keypoints.ESTIMATORS
-        for error in few_keypoints.ERRORS
+        for estimator in few_keypoints.COMPARED
+        for error in comparisons.JUDGING_METRICS
     ]
     figure = few_keypoints.figure_of_few(pd.DataFrame(rows))
     assert problems(figure) == [] and len(figure.axes) == 4

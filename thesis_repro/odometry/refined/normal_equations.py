@@ -14,11 +14,11 @@ from thesis_repro.odometry.refined import matrices
 # plain loop over the points takes twice as long. The sums go point by point, so the bits are those
 # of a plain loop.
 POINTS_PER_BLOCK = 64
-# Rows of a block, one quantity each. NUMBERS: five derivatives of the residual. WEIGHTED: the same,
+# Rows of a block, one quantity each. DERIVATIVES: five of the residual. WEIGHTED: the same,
 # times the weight, and the residual times the weight. They are rows of one array, so that the
 # compiler sees that they do not overlap.
 X, Y, U, V, L0, L1, M0, M1, INVERSE, RESIDUAL, RARITY, WEIGHT = range(12)
-NUMBERS, WEIGHTED, ROWS = 12, 17, 23
+DERIVATIVES, WEIGHTED, ROWS = 12, 17, 23
 
 
 @compiled
@@ -45,7 +45,7 @@ def normal_equations(r, t, points, scale, with_derivatives):
         for k in range(5):
             _write_derivatives(derivatives[k], k, rows, count)
         for k in range(6):
-            _add_products(sums[k], rows[WEIGHTED + k], rows[NUMBERS:], count)
+            _add_products(sums[k], rows[WEIGHTED + k], rows[DERIVATIVES:], count)
     hessian = np.empty((5, 5))
     for k in range(5):
         for j in range(k + 1):
@@ -97,7 +97,7 @@ def _write_derivatives(derivative, k, rows, count):
         slope = rows[L0, i] * d0 + rows[L1, i] * d1 + rows[M0, i] * c0 + rows[M1, i] * c1
         inverse = rows[INVERSE, i]
         number = (change - rows[RESIDUAL, i] * inverse * slope) * inverse
-        rows[NUMBERS + k, i], rows[WEIGHTED + k, i] = number, rows[WEIGHT, i] * number
+        rows[DERIVATIVES + k, i], rows[WEIGHTED + k, i] = number, rows[WEIGHT, i] * number
 
 
 @inlined
