@@ -41,7 +41,7 @@ def described(artefact: Artefact, files: list[str]) -> dict[str, Any]:
     content: Any = artefact.content
     values = {**artefact._asdict(), "files": files, "details": None, "rows": 0}
     if isinstance(content, pd.DataFrame):
-        shown = "" if artefact.for_programs else style.markdown(content).replace(r"\*\*", "**")
+        shown = "" if artefact.for_programs else style.markdown(content)
         return {**values, "kind": "table", "rows": len(content), "content": from_markdown(shown)}
     if isinstance(content, str):
         first, heading, rest = content.partition("\n## ")

@@ -303,13 +303,9 @@ def _rounded(number: re.Match) -> str:
 
 
 def save_table(table: pd.DataFrame, folder: Path, name: str, note: str) -> None:
-    """Write folder/name.csv and folder/name.md with the data note under the Markdown table.
-
-    A text between ** is bold in Markdown.
-    """
+    """Write folder/name.csv and folder/name.md with the data note under the Markdown table."""
     save_csv(table, folder / f"{name}.csv")
-    text = markdown(table).replace(r"\*\*", "**")
-    write_text(folder / f"{name}.md", f"{text}\n{in_markdown(note)}\n")
+    write_text(folder / f"{name}.md", f"{markdown(table)}\n{in_markdown(note)}\n")
 
 
 def save_csv(table: pd.DataFrame, path: Path) -> None:
@@ -341,7 +337,8 @@ def save(artefact: Artefact, folder: Path, note: str) -> list[str]:
 def markdown(table: pd.DataFrame) -> str:
     """Return a pandas table as Markdown, an empty one as "".
 
-    Numbers are aligned to the right, and missing values are empty. Names are no HTML.
+    Numbers are aligned to the right, and missing values are empty. Names are no HTML. What
+    stands between ** is bold.
     """
     if table.empty:
         return ""
@@ -356,4 +353,4 @@ def _cell(value: Any) -> str:
         return ""
     if isinstance(value, float):
         return f"{value:g}"
-    return in_markdown(value)
+    return in_markdown(value).replace(r"\*\*", "**")
