@@ -15,6 +15,7 @@ from keypoint_study.methods import METHODS, Asked
 from keypoint_study.sources import Source
 from thesis.settings import ROOT
 from thesis_repro.data import kitti
+from thesis_repro.data.sequence import Sequence
 from thesis_repro.running import program, workers
 from thesis_repro.running.files import progress, write_text
 from thesis_repro.segmentation import prediction
@@ -32,18 +33,17 @@ CHECKED = {
         "mirrored-exact",
     ),
 }
-SPLITS = 3  # of the keypoints of a step, of each kind
-DRAWS = 6  # of keypoints whose motion is compared with the exact one
+DRAWS = 24  # of keypoints whose motion is compared with the exact one
 
 
-def of_drive(sequence: kitti.Sequence, source: Source) -> tuple[pd.DataFrame, pd.DataFrame]:
+def of_drive(sequence: Sequence, source: Source) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Return the worths of a drive, and the true ones."""
     chosen = {
         (METHODS[name].title, number): METHODS[name].choose(Asked(sequence, source, number=number))
         for number, names in CHECKED.items()
         for name in names
     }
-    estimated = worth.worth_of(sequence, chosen, splits=SPLITS)
+    estimated = worth.worth_of(sequence, chosen)
     return estimated, worth_check.true_worths(sequence, chosen, DRAWS)
 
 
@@ -56,7 +56,7 @@ def main() -> None:
         world, **street_world.SIZES["demo"], seed=0, jobs=cores, only="kitti", replace=True
     )
     names = kitti.sequences(world / "kitti")
-    sequences = [kitti.Sequence(world / "kitti", name) for name in names]
+    sequences = [Sequence(world / "kitti", name) for name in names]
     model = prediction.load_shipped()
     for sequence in sequences:
         labels = folder / "labels" / sequence.name

@@ -4,7 +4,6 @@ from pathlib import Path
 
 from thesis_repro.data import layout
 from thesis_repro.data.geometry import CAMERAS
-from thesis_repro.data.sequence import Sequence  # noqa: F401  for kitti.Sequence
 from thesis_repro.errors import InputError
 
 TRUE_LABELS = "labels_0"  # exact label maps beside image_0, which only the embedded world has
