@@ -6,7 +6,7 @@ OpenCV vectorises over the columns of one window. Here LANES points are tracked 
 the compiler vectorises the loops over the lanes. Each lane adds in OpenCV's order: columns that it
 takes eight at a time go into four partial sums, the last ones into a fifth.
 
-1. `_fill` takes LANES points from the queue of a level of the pyramid and reads their pixels.
+1. `_read_templates` reads the pixels of LANES points from the queue of a level of the pyramid.
 2. `_start` computes their templates, `_advance` and `_move` move all windows by one step.
 3. Once few lanes are still at work, their points go back into the queue.
 
@@ -587,12 +587,7 @@ def _read_windows(block, pixels, level, lanes, found):
                 found[lanes[lane]] = False
                 lanes[lane] = IDLE
     if changed:
-        _unpack_window(block)
-
-
-@inlined
-def _unpack_window(block):
-    _unpack(block, WINDOW + 1)
+        _unpack(block, WINDOW + 1)
 
 
 @inlined

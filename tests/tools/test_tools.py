@@ -23,7 +23,7 @@ pytestmark = pytest.mark.slow
 def test_bench_compares_each_measurement_with_a_reference(small_world, monkeypatch):
     monkeypatch.setattr(bench, "REPEATS", 1)
     monkeypatch.setattr(bench, "WIDTHS", (5,))
-    monkeypatch.setattr(bench, "FIRST_USE", "import numba")  # to compile takes 18 seconds
+    monkeypatch.setattr(bench, "FIRST_USE", "import numba")  # to compile takes ten seconds
     table = bench.cost_ratios(Sequence(small_world / "kitti", "00").subset(5))
     assert table["ratio"].tolist() == pytest.approx(table["measured"] / table["reference"])
     assert (table["ratio"] > 0).all() and table["what"].str.contains(" the same bits").sum() == 1
