@@ -15,7 +15,7 @@ from keypoint_study import runner
 from keypoint_study.jobs import Job, runs_of
 from keypoint_study.plan import Study
 from keypoint_study.sources import Source
-from thesis_repro.data.kitti import Sequence
+from thesis_repro.data.sequence import Sequence
 
 GOLDEN = Path(__file__).with_name("runs.csv")
 pytestmark = pytest.mark.bits

@@ -75,7 +75,7 @@ def _move_aside(folder: Path, changed: str) -> None:
     # the record goes last, so that a killed move can be repeated
     for path in sorted(folder.iterdir(), key=lambda path: path.name == RECORD):
         path.rename(aside / path.name)
-    program.log.info(f"{folder}: moved what was made with another {changed} to {aside}")
+    program.log.info(f"{folder}: moved what was made with other {changed} to {aside}")
 
 
 def record(folder: str | Path) -> Any:
