@@ -46,7 +46,8 @@ def _execute(settings: Settings) -> int:
     at_once = [] if settings.jobs == 1 else ["-j2"]
     folder = os.path.relpath(settings.build, ROOT)
     command = [os.environ.get("MAKE", "make"), "-k", *at_once, "notebooks", f"RUN={folder}"]
-    if timing.folder_in_git(settings):  # else 09 also reads the times that 08 writes at its end
+    times = timing.folder_in_git(settings)
+    if times and times.is_dir():  # else 09 also reads the times that 08 writes at its end
         command.append("LAST=shuffled_runs.csv")
     # bars inside notebooks go to the terminal; a kernel that crashes says how
     terminal = os.ttyname(2) if sys.stderr.isatty() else os.devnull
