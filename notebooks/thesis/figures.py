@@ -38,6 +38,12 @@ def main() -> int:
     return status
 
 
+def shows_times_of_git(settings: Settings) -> bool:
+    """Whether a run's figures show times in git. Of frames that were never timed there are none."""
+    folder = timing.folder_in_git(settings)
+    return folder is not None and folder.is_dir()
+
+
 def _execute(settings: Settings) -> int:
     ipython = settings.build / "ipython"
     # what a kernel's compiled code says at its death goes to the log, not into the lost notebook
@@ -46,8 +52,7 @@ def _execute(settings: Settings) -> int:
     at_once = [] if settings.jobs == 1 else ["-j2"]
     folder = os.path.relpath(settings.build, ROOT)
     command = [os.environ.get("MAKE", "make"), "-k", *at_once, "notebooks", f"RUN={folder}"]
-    times = timing.folder_in_git(settings)
-    if times and times.is_dir():  # else 09 also reads the times that 08 writes at its end
+    if shows_times_of_git(settings):  # else 09 also reads those that 08 writes at its end
         command.append("LAST=shuffled_runs.csv")
     # bars inside notebooks go to the terminal; a kernel that crashes says how
     terminal = os.ttyname(2) if sys.stderr.isatty() else os.devnull
