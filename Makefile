@@ -42,7 +42,7 @@ help:
 	@echo "make check-data  check the folders KITTI=/path CITYSCAPES=/path KITTI_SEMANTIC=/path"
 	@echo "make excerpts    cut the frames of the evidence from KITTI=/path RAW=/path, and check them, into build/excerpts"
 	@echo "make evidence    make figures PROFILE=thesis from KITTI=build/excerpts, and keep what shows no frame; from other"
-	@echo "                 frames, elsewhere (a few hours on two cores; FRAMES=00:0-129,04:0-37 takes parts of sequences)"
+	@echo "                 frames, elsewhere (whole sequences take hours; FRAMES=00:0-129,04:0-37 takes parts of sequences)"
 	@echo "make timings     after make figures, or make evidence KITTI=build/excerpts: measure the times that their figures show"
 	@echo "make worth-check compare the worth of a keypoint with the truth, in the embedded world (some minutes)"
 	@echo "make trainings   after make figures: train nine more networks, and compare masks from all ten (some ten minutes)"

@@ -28,6 +28,7 @@ PAIRS = {
     ("200 strongest on the mask", "200 strongest"): (("mask", 200), ("strongest", 200)),
     ("200 strongest", "200 random ones"): (("strongest", 200), ("random", 200)),
     ("200 spread", "200 random ones"): (("spread", 200), ("random", 200)),
+    ("200 spread", "200 strongest"): (("spread", 200), ("strongest", 200)),
     ("the mask, filled", "the mask"): (("filled", 0), ("mask", 0)),
 }
 MASKS, EVERY = "all on the mask", "all keypoints"  # the comparison of the main study

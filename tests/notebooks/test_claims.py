@@ -65,6 +65,7 @@ def test_every_sequence_and_one():
     assert claims.is_everywhere(11, 11) == REPRODUCED
     assert claims.is_everywhere(10, 11) == NOT_REPRODUCED
     assert [claims.is_on_one(count, 5) for count in (2, 3)] == [NOT_REPRODUCED, REPRODUCED]
+    assert [claims.can_happen(count, 1) for count in (0, 1, 2)] == [*[CANNOT_TELL] * 2, REPRODUCED]
     assert claims.are_apart((5, 6), (3, 4)) == REPRODUCED
     assert claims.are_apart((3, 4), (5, 6)) == NOT_REPRODUCED
     assert claims.are_apart((3, 5), (4, 6)) == CANNOT_TELL
