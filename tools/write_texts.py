@@ -186,12 +186,11 @@ def worth_range(choice: str, number: int = 400) -> str:
     return f"{min(typical):.1f} to {max(typical):.1f}"
 
 
-def day_share() -> float:
-    """Return the share of variance that days have in the aligned ATE with masks (refined)."""
+def of_masks() -> pd.DataFrame:
+    """Return the deciding errors with masks, over those of all keypoints (refined), by street."""
     pair = equal_number.MASKS, equal_number.EVERY
     tables = read_table(f"{REAL}few_keypoints_runs"), read_table(f"{REAL}runs")
-    of_streets = equal_number.over(*equal_number.of_pair(*tables, pair, "refined"))
-    return equal_number.share_of_days(of_streets["se3"])
+    return equal_number.over(*equal_number.of_pair(*tables, pair, "refined"))
 
 
 def metres() -> list[float]:
@@ -308,7 +307,8 @@ FUNCTIONS = (
     book,
     equal,
     worth_range,
-    day_share,
+    of_masks,
+    equal_number.share_of_days,
     metres,
     whole,
     two,

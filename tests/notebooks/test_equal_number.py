@@ -59,15 +59,31 @@ def test_the_share_of_days_is_found():
 
 @pytest.mark.torture
 def test_how_often_streets_of_one_day_mislead(capsys):
-    """Prints percent of studies without a difference whose interval excludes 1."""
-    random, rates = np.random.default_rng(0), {}
+    """Prints percent of studies without a difference whose interval excludes 1, or whose two do.
+
+    The verdict of two is that of both deciding errors, which are correlated.
+    """
+    random, rates, of_two = np.random.default_rng(0), {}, {}
     for share in (0, 0.4):
         intervals = [ratios.typical_interval(_errors(random, share))[1:] for _ in range(2000)]
         sides = [ratios.side_of_one(*np.exp(ends)) for ends in intervals]
         rates[share] = np.count_nonzero(sides) / 20
+        for correlation in (0.5, 0.8):
+            words = [equal_number.word(_both(random, share, correlation)) for _ in range(2000)]
+            wrong = len(words) - words.count(verdicts.NO_CLEAR_DIFFERENCE)
+            of_two[share, correlation] = wrong / 20
     with capsys.disabled():
         print(f"\nan interval errs (%), by the share of variance of a day: {rates}")
+        print(f"two err together (%), by this share and the errors' correlation: {of_two}")
     assert rates[0] < 6 < rates[0.4]
+    assert of_two[0, 0.8] < 3 < of_two[0.4, 0.5] < of_two[0.4, 0.8] < rates[0.4]
+
+
+def _both(random, share, correlation):
+    """Ratios of both deciding errors, without a difference."""
+    first, other = (_errors(random, share) for _ in range(2))
+    second = correlation * first + np.sqrt(1 - correlation**2) * other
+    return np.exp(pd.DataFrame(dict(zip(equal_number.DECIDING, (first, second), strict=True))))
 
 
 def _errors(random, share):
