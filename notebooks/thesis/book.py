@@ -38,7 +38,7 @@ def build(settings: Settings, *options: str) -> int:
     options: for Sphinx.
     """
     folder = settings.build / "book"
-    _arrange(_parts(settings), folder / "source")
+    _arrange(_parts(settings), folder)
     pages = folder / "html"
     places = ["-c", ROOT / "docs", "-d", folder / "read", folder / "source", pages]
     command = [sys.executable, "-m", "sphinx", "--quiet", *options, *map(str, places)]
@@ -60,11 +60,15 @@ def _parts(settings: Settings) -> dict[Path, Path]:
     return parts
 
 
-def _arrange(parts: dict[Path, Path], source: Path) -> None:
-    """Make a folder hold copies of these files and no others. What is there and equal stays."""
-    for path in source.rglob("*.*"):
-        if path.is_file() and path.relative_to(source) not in parts:
-            path.unlink()
+def _arrange(parts: dict[Path, Path], folder: Path) -> None:
+    """Make a book's source hold copies of these files and no others. What is equal stays.
+
+    Every page lists all, so a book of other files, such as an earlier version's, is written anew.
+    """
+    source = folder / "source"
+    there = {path.relative_to(source) for path in source.rglob("*") if path.is_file()}
+    if there != set(parts):
+        shutil.rmtree(folder, ignore_errors=True)
     for place, path in parts.items():
         copy = source / place
         if not (copy.is_file() and filecmp.cmp(path, copy, shallow=False)):

@@ -98,3 +98,15 @@ def test_only_what_changed_is_read_again(pages, settings):
     assert book.build(settings) == 0
     changed = [path.stem for path, time in times.items() if path.stat().st_mtime_ns != time]
     assert changed == ["01_load_images_and_labels"]
+
+
+def test_a_book_of_other_files_is_written_anew(tmp_path):
+    (tmp_path / "one").write_text("one")
+    parts, page = {Path("docs/one"): tmp_path / "one"}, tmp_path / "book" / "html" / "other"
+    for names, stays in ((parts, False), (parts, True), ({Path("two"): tmp_path / "one"}, False)):
+        page.parent.mkdir(parents=True, exist_ok=True)
+        page.touch()
+        book._arrange(names, tmp_path / "book")
+        assert page.exists() == stays
+        source = tmp_path / "book" / "source"
+        assert {path for path in names if (source / path).is_file()} == set(names)
