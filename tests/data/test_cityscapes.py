@@ -1,11 +1,18 @@
 """Pairs of images and label maps."""
 
+import zlib
+
 import cv2
 import numpy as np
 import pytest
 
 from thesis_repro.data import cityscapes
 from thesis_repro.errors import InputError
+
+
+def test_ids_and_colours_are_those_of_cityscapes():
+    assert [label.id for label in cityscapes.LABELS] == list(range(36))
+    assert zlib.crc32(cityscapes.COLORS.tobytes()) == 1305786318
 
 
 def test_the_class_weights_are_those_of_table_3_2():

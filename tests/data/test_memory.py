@@ -68,9 +68,11 @@ def test_wrong_arrays_are_named(street, wrong):
         tr.Sequence.from_arrays(**given)
 
 
-@pytest.mark.parametrize("unit, impossible", [(1, 0), (1e3, 5), (1e9, 5)])
-def test_times_in_other_units_are_told(street, caplog, unit, impossible):
-    drive(street, speed=8, times=unit * 0.1 * np.arange(6))
+@pytest.mark.parametrize(
+    "unit, pause, impossible", [(1, 0, 0), (1, 9, 1), (1e3, 0, 5), (1e9, 0, 5)]
+)
+def test_times_in_other_units_and_pauses_are_told(street, caplog, unit, pause, impossible):
+    drive(street, speed=8, times=unit * 0.1 * np.arange(6) + [0, 0, 0, 0, 0, pause])
     assert [f"{impossible} of 5 steps are impossible" in line for line in caplog.messages] == (
         [True] if impossible else []
     )

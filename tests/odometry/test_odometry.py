@@ -533,6 +533,9 @@ def test_settings_are_equal_elsewhere_and_so_is_their_record():
     assert record["estimator"] == "thesis_repro.odometry.estimators.refined"
     with pytest.raises(InputError, match="number of keypoints"):
         keypoints.spread(0)
+    assert keypoints.spread(2**31 - 1).number == 2**31 - 1
+    with pytest.raises(InputError, match="number of keypoints"):
+        keypoints.spread(2**31)
 
 
 @pytest.mark.parametrize("estimator", [None, refined])
@@ -695,6 +698,17 @@ def test_runs_share_no_keypoints_if_a_setting_differs_that_may_matter(
 def test_wrong_settings_are_named(setting, value):
     with pytest.raises(InputError, match=setting):
         replace(THESIS, **{setting: value})
+
+
+@pytest.mark.parametrize(
+    "setting, most",
+    [("max_keypoints", 2**31 - 1), ("redetect_below", 2**31 - 1), ("quality", 1)]
+    + [("shuffle_seed", 2**32 - 1)],
+)
+def test_the_largest_number_of_a_setting_is_taken_and_the_next_refused(setting, most):
+    assert getattr(replace(THESIS, **{setting: most}), setting) == most
+    with pytest.raises(InputError, match=setting):
+        replace(THESIS, **{setting: most + 1})
 
 
 def test_wrong_frames_and_masks_are_named_and_leave_the_state(drive):
