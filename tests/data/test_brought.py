@@ -258,9 +258,11 @@ def test_colours_are_read_through_a_table(tmp_path):
         label_ids.read(path, table(tmp_path, NAMES.items()))
 
 
-@pytest.mark.parametrize("text", ["7,road\n8\n", "7,road\n8,street\n", "7,road\nx,sky\n"])
-def test_a_bad_line_of_a_table_is_named(tmp_path, text):
-    (tmp_path / "ids.csv").write_text(text)
+@pytest.mark.parametrize(
+    "line", ["8", "8,street", "x,sky", "7,sky", "#464646,sky", "-2,sky", "65536,sky"]
+)
+def test_a_bad_line_of_a_table_is_named(tmp_path, line):
+    (tmp_path / "ids.csv").write_text(f"7,road\n{line}\n")
     with pytest.raises(InputError, match="ids.csv, line 2: "):
         label_ids.read_table(tmp_path / "ids.csv")
 
