@@ -109,6 +109,8 @@ def lesson(name, notebook):
     """Return a notebook with its name in the lab and alternative texts, as JSON."""
     first = notebook["cells"][0]
     first["source"] = "".join(first["source"]) + f"\n\n**In the lab:** `make lab`, `{name}.ipynb`."
+    if not any(cell.get("outputs") for cell in notebook["cells"]):
+        first["source"] += "\n\n**Not run with the data of this book**, so without results."
     for cell in notebook["cells"]:
         for output in cell.get("outputs", ()):
             written = output.get("data", {}).get("text/markdown")

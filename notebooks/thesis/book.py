@@ -52,7 +52,8 @@ def _parts(settings: Settings) -> dict[Path, Path]:
     paths = (path for pattern in PARTS for path in ROOT.glob(pattern) if path.is_file())
     parts = {path.relative_to(ROOT): path for path in paths}
     parts[Path("index.md")] = ROOT / "docs" / "index.md"
-    for path in listed(settings.build / "notebooks", "*.ipynb"):
+    executed = listed(settings.build / "notebooks", "*.ipynb")  # without Cityscapes, not all
+    for path in [*ROOT.glob("notebooks/*.ipynb"), *executed]:
         parts[Path("notebooks", path.name)] = path
     if not settings.figures_in_git:
         for path in listed(settings.published, "*.*"):

@@ -88,8 +88,9 @@ def test_the_first_page_counts_the_claims_and_has_a_card_for_each_lesson(pages):
     assert cards == [f"notebooks/{Path(name).stem}.html" for name in NOTEBOOKS]
 
 
-def test_only_what_changed_is_read_again(pages, settings):
+def test_only_what_changed_is_read_again_and_what_was_not_run_says_so(pages, settings):
     read = settings.build / "book" / "read"
+    (settings.build / "notebooks" / NOTEBOOKS[1]).unlink()
     times = {path: path.stat().st_mtime_ns for path in read.rglob("*.doctree")}
     path = settings.build / "notebooks" / NOTEBOOKS[0]
     notebook = json.loads(path.read_text())
@@ -97,7 +98,12 @@ def test_only_what_changed_is_read_again(pages, settings):
     path.write_text(json.dumps(notebook))
     assert book.build(settings) == 0
     changed = [path.stem for path, time in times.items() if path.stat().st_mtime_ns != time]
-    assert changed == ["01_load_images_and_labels"]
+    assert sorted(changed) == ["01_load_images_and_labels", "02_augmentation"]
+    told = [
+        "Not run with the data" in (settings.build / f"book/html/notebooks/{name}.html").read_text()
+        for name in sorted(changed)
+    ]
+    assert told == [False, True]
 
 
 def test_a_book_of_other_files_is_written_anew(tmp_path):
