@@ -175,12 +175,15 @@ def without_network():
 
 
 @pytest.mark.torture
-def test_odd_names_and_no_network_work_and_data_is_only_read(folder, tmp_path):
-    root, out = folder.rename(tmp_path.with_name(ODD)), tmp_path / f"out {ODD}"
+def test_odd_names_and_no_network_work_and_data_is_only_read(small_world, small_labels, tmp_path):
+    root, out = tmp_path / ODD, tmp_path / f"out {ODD}"
+    shutil.copytree(small_world / "kitti", root / "kitti")
+    shutil.copytree(small_labels / "00", root / "labels")
     kitti, labels = ["--kitti", root / "kitti"], ["--labels", root / "labels"]
     drawn = ["--plot", out / f"{ODD}.svg"]
     masks = ["--masks", out / f"masks {ODD}"]
-    quick = ["--repetitions", 1, "--widths", 2, 3, "--jobs", 1, "--controls", 3]
+    quick = ["--sequences", "00", "--repetitions", 1, "--widths", 2, 3, "--jobs", 1]
+    quick += ["--controls", 3]
     before = snapshot(root)
     for words in (
         ["masks", *kitti, "--sequence", "00", *labels, "--dilation", 3, "--output", masks[1]],
