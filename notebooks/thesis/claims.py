@@ -352,12 +352,11 @@ def _of_keypoints(tables: Tables) -> list[Claim]:
     )
     fewer = tables.over("fewer", "rmse")
     tenth = tables.audit("59", "nine tenths of the keypoints over all", **RMSE_OF_THESIS)
+    names = ("dropout", "baseline")
+    of_names = [comparisons.of_method(tables.ablations, name, "thesis") for name in names]
     failing, failing_of_all = (
         ratios.failing_sequences(ratios.has_failed(runs).set_axis(runs["sequence"]))
-        for runs in (
-            comparisons.of_method(tables.ablations, method, "thesis")
-            for method in ("dropout", "baseline")
-        )
+        for runs in of_names
     )
     spread = equal_number.over(*_few(tables.few, ("spread", 200), ("all", 0)))
     return [
