@@ -29,14 +29,13 @@ export OMP_NUM_THREADS := $(firstword $(subst $(comma), ,$(OMP_NUM_THREADS)))
 endif
 unexport PYTHONHOME PYTHONDONTWRITEBYTECODE PYTHONSTARTUP JUPYTER_PATH CDPATH TF_USE_LEGACY_KERAS XLA_FLAGS TF_XLA_FLAGS
 
-.PHONY: help setup figures book notebooks page excerpts evidence worth-check timings pictures camvid trainings test torture mutants lint lab bench weights pins clean check-data
+.PHONY: help setup figures book notebooks page excerpts evidence worth-check timings pictures camvid trainings test torture lint lab bench weights pins clean check-data
 help:
 	@echo "make figures     write every table and figure to figures/, from embedded data, or from KITTI=/path CITYSCAPES=/path"
 	@echo "                 (KITTI_SEMANTIC=/path: also test the label maps); size: PROFILE=smoke|lab|demo|thesis, or single:"
 	@echo "                 IMAGE_SIZE BASE_FILTERS BATCH_SIZE EPOCHS FRAMES=N|all WIDTHS=5,10|1-15 REPETITIONS; processes: JOBS"
 	@echo "make test, lint  run the tests, and every notebook with PROFILE=smoke; check style (Ruff), types (mypy), imports"
 	@echo "make torture     run the tests of kills, faults, bad input, and of the oldest and newest packages (some minutes)"
-	@echo "make mutants     change one operator or constant at a time, in a copy: do the tests notice? (some ten minutes)"
 	@echo "make lab         open copies of the notebooks in JupyterLab with PROFILE=lab (up to two minutes each);"
 	@echo "                 in a container LISTEN=0.0.0.0"
 	@echo "make check-data  check the folders KITTI=/path CITYSCAPES=/path KITTI_SEMANTIC=/path"
@@ -132,8 +131,6 @@ test: setup
 	@$(BIN)/python -m pytest -q -n auto --dist loadfile --no-loadscope-reorder
 torture: setup
 	@$(BIN)/python -m pytest -q -m torture
-mutants: setup
-	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 OPENCV_FOR_THREADS_NUM=1 $(BIN)/python tools/mutants.py
 lint: setup
 	@$(BIN)/ruff format --check --quiet . && $(BIN)/ruff check . && $(BIN)/mypy && $(BIN)/lint-imports --no-logo --no-cache
 # Lessons edit copies, so that the notebooks in git stay as they are. An edited copy is kept.
