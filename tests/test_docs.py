@@ -10,7 +10,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import pandas as pd
 import pytest
 from street import Street
 
@@ -75,20 +74,6 @@ def test_help_begins_with_an_example_that_runs(small_world, tmp_path, monkeypatc
     for name in names["runs"]:
         assert len(read_poses(f"{name}.txt")) == 12
     assert names["result"].frames["detected"].mean() == 200  # the last one, spread
-
-
-def test_the_first_training_is_that_of_the_comparison():
-    trainings = pd.read_csv(ROOT / "figures/trainings.csv")
-    compared = pd.read_csv(ROOT / "figures/comparison.csv")
-    for row in trainings[trainings["training"] == "seed 0"].itertuples():
-        is_same = compared["estimator"].str.startswith(row.estimator)
-        is_same &= (compared["keypoints"] == "masks, width 10") & (
-            compared["over"] == "all keypoints"
-        )
-        (line,) = compared[is_same].to_dict("records")
-        for column, name in (("se3", "aligned ATE"), ("rotation", "rotational RPE, 1 frame")):
-            ends = [getattr(row, f"{column}_{end}") for end in ("ratio", "low", "high")]
-            assert line[name].rstrip(" ↑↓") == "{:.2f} ({:.2f}-{:.2f})".format(*ends)
 
 
 class Camera:

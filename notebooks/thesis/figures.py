@@ -8,10 +8,12 @@ import platform
 import subprocess
 import sys
 
-from thesis import book, checked, gallery, timing, trainings, used
+from thesis import book, checked, gallery, timing, used
 from thesis.settings import ROOT, Settings, read_settings
 from thesis_repro.running import program, provenance
-from thesis_repro.running.files import write_text
+from thesis_repro.running.files import listed, write_text
+
+RECORDED_NETWORK = "4ac3c7d86e69"  # digest of the one behind the figures in git
 
 
 def main() -> int:
@@ -33,9 +35,29 @@ def main() -> int:
         status = _execute(settings)
         gallery.update(settings)
         status = book.build(settings) or status
-    if note := trainings.network_note(settings):
+    if note := network_note(settings):
         print(note)
     return status
+
+
+def network_note(settings: Settings) -> str:
+    """Return one line that says whether a run's network is the recorded one, to the bit.
+
+    It is empty for a run of other data or sizes. The digest of the network's weights is in the
+    record of its label maps.
+    """
+    folders = listed(settings.build / "labels", "*")
+    if not settings.figures_in_git or not folders:
+        return ""
+    network = provenance.record(folders[0])["model"]
+    if network == RECORDED_NETWORK:
+        return f"The network of this run is the recorded one, to the bit ({network})."
+    return (
+        f"The network of this run ({network}) is not the recorded one ({RECORDED_NETWORK}), so numbers differ. "
+        "Causes: a notebook was edited; TensorFlow or Keras have another version; a GPU was used; the "
+        "processor is not x86, or has no AVX2; TF_ENABLE_ONEDNN_OPTS, ONEDNN_MAX_CPU_ISA, XLA_FLAGS or "
+        "TF_NUM_INTRAOP_THREADS were set."
+    )
 
 
 def shows_times_of_git(settings: Settings) -> bool:

@@ -4,9 +4,8 @@ from typing import Any
 
 import pandas as pd
 
-from keypoint_study.jobs import CONTROL_WIDTH
 from keypoint_study.report import findings, style, texts
-from thesis import artefacts, domain_gap, trainings
+from thesis import artefacts, domain_gap
 from thesis.settings import Settings
 from thesis_repro.running.files import write_text
 
@@ -38,13 +37,9 @@ def write(
     """
     quality = domain_gap.label_map_quality(settings.build).round(3)
     quality = quality.filter(["domain", "images", "classes", "mean_iou", "seen"])
-    of_trainings = trainings.table_of_trainings() if settings.figures_in_git else pd.DataFrame()
     more = texts.render(
         "findings_of_thesis.md.j2",
         label_maps=[style.markdown(table) for table in (quality,) if len(table)],
-        trainings=[style.markdown(table) for table in (of_trainings,) if len(table)],
-        count=trainings.read()["training"].nunique(),
-        thesis_width=CONTROL_WIDTH,
     )
     text = findings.findings_of(runs, compared, note, settings.kitti_is_embedded, more)
     write_text(settings.figures / "findings.md", text)

@@ -1,6 +1,6 @@
 """The audit's rows and the measurements that are joined to them.
 
-Also the gap between domains, and the recorded trainings.
+Also the gap between domains, and the recorded network.
 """
 
 from types import SimpleNamespace
@@ -18,7 +18,7 @@ from thesis import (
     audit_of_data,
     audit_of_tables,
     domain_gap,
-    trainings,
+    figures,
 )
 from thesis.settings import ROOT
 from thesis_repro.data.cityscapes import ID
@@ -219,14 +219,14 @@ def test_the_quality_of_label_maps_is_recorded(tmp_path):
 
 # A run is told whether its network is the recorded one
 
-RECORDED = trainings.read()["network"].iloc[0]
+RECORDED = figures.RECORDED_NETWORK
 
 
 @pytest.mark.parametrize(
     "network, in_git, named",
     [
         (RECORDED, True, [RECORDED]),
-        ("0" * 12, True, [RECORDED, "0" * 12, "trainings.csv"]),
+        ("0" * 12, True, [RECORDED, "0" * 12]),
         ("0" * 12, False, []),
         (None, True, []),
     ],
@@ -234,6 +234,6 @@ RECORDED = trainings.read()["network"].iloc[0]
 def test_the_networks_are_compared(tmp_path, network, in_git, named):
     if network:
         provenance.stage(tmp_path / "labels" / "00", model=network)
-    note = trainings.network_note(SimpleNamespace(build=tmp_path, figures_in_git=in_git))
+    note = figures.network_note(SimpleNamespace(build=tmp_path, figures_in_git=in_git))
     assert bool(note) == bool(named) and all(name in note for name in named)
     assert ("XLA_FLAGS" in note) == (len(named) > 1)
