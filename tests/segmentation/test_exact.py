@@ -2,8 +2,7 @@
 
 TensorFlow's graph optimiser decides which operations run, and Eigen computes some of them by RCPPS
 and RSQRTPS, which Intel and AMD make differently. So these tests read the optimised graphs, and a
-machine of one maker tells what a machine of the other would do. `tools/emulated.py` compares the
-results with those of an emulator.
+machine of one maker tells what a machine of the other would do.
 """
 
 from collections import Counter
@@ -64,7 +63,7 @@ ON_DATA = ("Dataset", "Iterator", "Optional")
 # 139 functions (objdump -d libtensorflow_cc.so.2). They belong to Reciprocal, Inv and Rsqrt, to
 # Softmax, FusedBatchNorm and LRN without oneDNN, to Atan, Atan2, Erfc, Ndtri, Bessel functions and
 # logarithms of complex numbers, and to optimisers in C++, but to none of these names. A new name
-# goes here only if that is true of it, and if `tools/emulated.py` still finds equal bits.
+# goes here only if that is true of it.
 EXACT = set(
     [
         "Add",

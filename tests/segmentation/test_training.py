@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 import segmentation_models as sm
 import tensorflow as tf
+from small_training import digest as digest_of_training
 from trials import succeed
 
-import emulated
 from thesis_repro.errors import InputError
 from thesis_repro.segmentation import augmentation, training
 
@@ -218,7 +218,7 @@ RECORDED = "9d39effb0706"
 @pytest.fixture(scope="module")
 def digest():
     """The bits of a training in this process."""
-    return emulated.digest()
+    return digest_of_training()
 
 
 @pytest.mark.skipif(
@@ -229,11 +229,10 @@ def test_one_core_and_all_give_the_same_bits(digest):
     """And settings of another Keras in the environment do no harm."""
     code = (
         "import os; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))}); "
-        "import emulated; print(emulated.digest())"
+        "import small_training; print(small_training.digest())"
     )
-    tools = Path(emulated.__file__).parent
     another_keras = {"TF_USE_LEGACY_KERAS": 1, "KERAS_BACKEND": "jax"}
-    one_core = succeed([sys.executable, "-c", code], tools, **another_keras)
+    one_core = succeed([sys.executable, "-c", code], Path(__file__).parent, **another_keras)
     assert one_core.stdout.split()[-1] == digest
 
 
