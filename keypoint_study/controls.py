@@ -8,20 +8,16 @@ from typing import Any
 
 import cv2
 import numpy as np
-from scipy.spatial.distance import cdist
 
 from keypoint_study.sources import FileMasks
-from thesis_repro.data.cityscapes import ID
 from thesis_repro.data.sequence import Sequence
 from thesis_repro.masks import dilate
-from thesis_repro.masks.folders import LabelMasks
-from thesis_repro.odometry import THESIS, OdometrySettings
+from thesis_repro.odometry import THESIS
 
 LARGEST_GRADIENT = 8 * 255  # |dx| + |dy| of 3x3 Sobel operators
 COVERAGE_TOLERANCE = 0.002  # of the frame
 SAMPLE = 12  # frames on which the distance between keypoints is chosen
 STEP = 0.1  # pixels between the distances that are tried
-NEIGHBOURHOOD = 40  # pixels
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,39 +138,7 @@ def image_edges(masks: FileMasks, sequence: Sequence, line_width: int, index: in
     return best
 
 
-def without_classes(masks: LabelMasks, classes: tuple[str, ...], index: int) -> np.ndarray:
-    """The whole frame but some classes. The label map is enlarged by nearest neighbour."""
-    left_out = np.isin(masks.label_map(index), [ID[name] for name in classes])
-    allowed = np.where(left_out, np.uint8(0), np.uint8(255))
-    return cv2.resize(allowed, masks.size[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
-
-
-# Detectors, and their settings
-
-
-def beside(
-    frame: np.ndarray, settings: OdometrySettings = THESIS, mask: np.ndarray | None = None
-) -> np.ndarray:
-    """Find keypoints beside a mask: a neighbour off it for each keypoint on it.
-
-    It is the nearest one that no other has taken, the strongest choosing first, up to NEIGHBOURHOOD
-    away. A keypoint without such a neighbour has none, so there are fewer than on the mask.
-    """
-    from thesis_repro.odometry import corners
-
-    everything = corners.detect(frame, settings)
-    if mask is None:
-        return everything
-    columns, rows = everything.astype(int).T
-    off = everything[mask[rows, columns] == 0]
-    chosen = []
-    distances = cdist(corners.detect(frame, settings, mask), off)
-    for of_keypoint in distances if len(off) else ():
-        nearest = of_keypoint.argmin()
-        if of_keypoint[nearest] <= NEIGHBOURHOOD:
-            chosen.append(nearest)
-            distances[:, nearest] = np.inf
-    return off[chosen]
+# How far keypoints are apart
 
 
 def min_distance(sequence: Sequence, number: float) -> float:

@@ -6,7 +6,7 @@ the number of keypoints that masks leave, so they are made once the masked runs 
 (`runner.keypoint_controls`).
 """
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import chain
@@ -23,7 +23,6 @@ from keypoint_study.methods import (
     MASK_CONTROLS,
     METHODS,
     REFERENCE,
-    STUDY,
     WORTH,
     Asked,
     changed,
@@ -156,14 +155,13 @@ def first_jobs(
     tested: int | None = None,
     sources: Iterable[Source] = (Source(Path()),),
     repetitions: int = 1,
-    named: Collection[str] = (),
 ) -> list[Job]:
     """Return the jobs that need no other results.
 
     These are all keypoints, masks of every width, and the controls that are masks.
     widths: pixels, for masks from label maps, by estimator: {"thesis": range(1, 16)}.
     tested: width (pixels) of the controls, None for no controls; it is added to the widths of every
-    estimator. named: controls that not every study runs.
+    estimator.
     sources: of masks, keypoints or paths. All keypoints are run once for all sources.
     """
     all_widths = set(chain(*widths.values()))
@@ -180,7 +178,7 @@ def first_jobs(
             of_source = sorted(all_widths) if source.has_width else [None]
             jobs += [replace(masks, dilation_width=width) for width in of_source]
             if tested:
-                controls = mask_controls(source, sequence, tested, named).items()
+                controls = mask_controls(source, sequence, tested).items()
                 jobs += [
                     replace(masks, method=name, dilation_width=width) for name, width in controls
                 ]
@@ -193,18 +191,15 @@ def first_jobs(
     ]
 
 
-def mask_controls(
-    source: Source, sequence: Sequence, width: int | None, named: Collection[str] = ()
-) -> dict[str, int | None]:
+def mask_controls(source: Source, sequence: Sequence, width: int | None) -> dict[str, int | None]:
     """Return {method: its width} of the controls that are masks, which a source allows.
 
-    width: pixels, of masks from label maps. named: controls that not every study runs.
+    width: pixels, of masks from label maps.
     """
     allowed: dict[str, int | None] = {}
     for name in MASK_CONTROLS:
-        method = METHODS[name]
-        is_of_labels = method.group == LABEL_MAPS
-        if (STUDY in method.where or name in named) and (source.has_label_maps or not is_of_labels):
+        is_of_labels = METHODS[name].group == LABEL_MAPS
+        if source.has_label_maps or not is_of_labels:
             allowed[name] = width if source.has_width or is_of_labels else None
     if not (sequence.folder / TRUE_LABELS).is_dir():
         allowed.pop("true-labels", None)
@@ -217,12 +212,11 @@ def worth_jobs(
     width: int | None,
     numbers: Iterable[int] = (DECIDING,),
     with_controls: bool = True,
-    named: Collection[str] = (),
 ) -> list[Job]:
     """Return the jobs of a study for `typical_worth.WORTH`, of one sequence after the other.
 
     numbers: of keypoints that are drawn, see `methods.with_numbers`. with_controls: also altered
-    masks, and the controls of `mask_controls`; named: see there.
+    masks, and the controls of `mask_controls`.
     """
     pairs = with_numbers(WORTH, numbers)
     jobs: list[Job] = []
@@ -235,7 +229,7 @@ def worth_jobs(
                 of_source = {source.kind: None}
             elif with_controls:
                 of_source |= dict.fromkeys(of_group(ALTERED), own)
-                of_source |= mask_controls(source, sequence, width, named)
+                of_source |= mask_controls(source, sequence, width)
             widths.append((source.name, of_source))
         jobs += [
             Job(sequence.name, name, of_source[name], number, source=source)

@@ -16,11 +16,10 @@ import numpy as np
 from keypoint_study import ablations, controls
 from keypoint_study.controls import MadeMasks
 from keypoint_study.sources import Source
-from thesis_repro.data.cityscapes import LABELS
 from thesis_repro.data.ids import LABEL_IDS
 from thesis_repro.data.kitti import TRUE_LABELS
 from thesis_repro.data.sequence import Sequence
-from thesis_repro.masks import MOVABLE, MaskSettings
+from thesis_repro.masks import MaskSettings
 from thesis_repro.odometry import THESIS, OdometrySettings
 from thesis_repro.odometry.keypoints import filled, filtered, orb, spread
 from thesis_repro.odometry.loop import detect
@@ -110,11 +109,9 @@ def drawn_on_masks(asked: Asked) -> Choice:
     return THESIS, MadeMasks(ablations.random_keypoints_on, masked(asked)[1], values)
 
 
-def altered(
-    make: Callable, *values: Any, of: Callable[[Asked], Choice] = masked
-) -> Callable[[Asked], Choice]:
-    """Return a method with masks that a function makes from those of another one."""
-    return lambda asked: (THESIS, MadeMasks(make, of(asked)[1], values))
+def altered(make: Callable, *values: Any) -> Callable[[Asked], Choice]:
+    """Return a method with masks that a function makes from those of the source."""
+    return lambda asked: (THESIS, MadeMasks(make, masked(asked)[1], values))
 
 
 def with_lines(make: Callable) -> Callable[[Asked], Choice]:
@@ -175,21 +172,12 @@ def changed(own: OdometrySettings, changes: Mapping[str, Any]) -> OdometrySettin
 
 # Where a method is compared, and with how many keypoints
 
-# studies with controls; those that name it (--controls NAME); chapter 4, the ablations and few
-# keypoints, of the notebooks; the worth of a keypoint
-STUDY, NAMED, CHAPTER_4, ABLATIONS, FEW, WORTH = (
-    "study",
-    "named",
-    "chapter 4",
-    "ablations",
-    "few",
-    "worth",
-)
+# studies with controls; chapter 4, ablations and few keypoints of the notebooks; the worth
+STUDY, CHAPTER_4, ABLATIONS, FEW, WORTH = "study", "chapter 4", "ablations", "few", "worth"
 # all that it leaves; each number of a list; the number that decides on the worth; as many as masks
 # leave
 ALL, EACH, DECIDING, AS_MANY = 0, "each", 400, "as many"
 IN_STUDY: Mapping[str, Collection] = {STUDY: {ALL}, WORTH: {DECIDING}}
-IF_NAMED: Mapping[str, Collection] = {NAMED: {ALL}, WORTH: {DECIDING}}
 ABLATION: Mapping[str, Collection] = {ABLATIONS: {ALL}}
 
 
@@ -283,57 +271,9 @@ METHODS = {  # in the order in which they are shown
         "reduced keypoints", THESIS_ONLY, strongest(all_keypoints), {CHAPTER_4: {AS_MANY}}
     ),
 }
-# Whether it is what lies under the masks, or where in the frame they are: exact boundaries in
-# mirrored places, keypoints beside the masks, and few that are spread over the frame, on the masks
-# or off them.
-IN_PLACE = {
-    "mirrored-exact": Method(
-        "mirrored exact boundaries",
-        LABEL_MAPS,
-        altered(controls.mirrored, of=METHODS["exact-boundaries"].choose),
-        IF_NAMED,
-    )
-}
-IN_PLACE |= {
-    f"beside-{name}": Method(
-        f"beside the {METHODS[name].title}",
-        LABEL_MAPS,
-        found_by(controls.beside, METHODS[name].choose),
-        IF_NAMED,
-    )
-    for name in ("masked", "exact-boundaries", "mirrored")
-}
-IN_PLACE |= {
-    f"spread-{where}": Method(
-        f"{FEW_SPREAD} spread {words} the masks",
-        LABEL_MAPS,
-        found_by(spread(FEW_SPREAD), METHODS[name].choose),
-        IF_NAMED,
-    )
-    for where, words, name in (("on", "over", "masked"), ("off", "off", "inverse"))
-}
-# which class could be left out
-LEFT_OUT = {
-    "vegetation": ("vegetation",),
-    "road and sidewalk": ("road", "sidewalk"),
-    "buildings": ("building", "wall", "fence"),
-    "terrain": ("terrain",),
-    "poles and signs": ("pole", "traffic sign", "traffic light"),
-    "vehicles and people": tuple(LABELS[number].name for number in MOVABLE),
-}
-EXPLORED = IN_PLACE | {
-    f"without-{name.replace(' ', '-')}": Method(
-        f"without {name}",
-        LABEL_MAPS,
-        found_by(filtered, altered(controls.without_classes, classes)),
-        IF_NAMED,
-    )
-    for name, classes in LEFT_OUT.items()
-}
 # pixels that are kept; the first two leave out distant points, the last near ones
 PARALLAX = {"parallax-1": (1, np.inf), "parallax-3": (3, np.inf), "parallax-20": (0, 20)}
 METHODS |= {
-    **EXPLORED,
     "dropout": ablation(of_sequence(ablations.random_keypoints, 0.9)),
     # a twentieth, a tenth and a fifth of the thesis's 2000
     **{f"strongest-{few}": ablation(at_most(few)) for few in (100, 200, 400)},

@@ -26,8 +26,7 @@ class Study:
     sequences: their names. widths: pixels, for masks from label maps. tested: width of the
     controls, None for no controls. estimators: their names. frames: number of frames of each
     sequence, None for all. scale_gate: metres, see OdometrySettings. masked_settings: other
-    settings of the odometry, for all runs with masks. without_border: of Sequence. controls: those
-    that not every study runs.
+    settings of the odometry, for all runs with masks. without_border: of Sequence.
     """
 
     kitti: Path
@@ -41,7 +40,6 @@ class Study:
     scale_gate: float = THESIS.scale_gate
     masked_settings: dict[str, Any] = field(default_factory=dict)
     without_border: bool = False
-    controls: tuple[str, ...] = ()
 
     @cached_property
     def opened(self) -> list[Sequence]:
@@ -102,7 +100,6 @@ class Study:
                     tested=self.tested,
                     sources=self.sources,
                     repetitions=self.repetitions,
-                    named=self.controls,
                 )
             )
             outcome = first = run_all(runs)
@@ -185,7 +182,6 @@ class Study:
             folder / "worth",
             with_controls=self.tested is not None,
             masked_settings=self.masked_settings,
-            named=self.controls,
             processes=processes,
             scheduler=scheduler,
         )

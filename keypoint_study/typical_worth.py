@@ -29,7 +29,6 @@ def worths_of(
     numbers: Iterable[int] = (DECIDING,),
     *,
     with_controls: bool = True,
-    named: Collection[str] = (),
     masked_settings: Mapping[str, Any] = {},
     **workers: Any,
 ) -> pd.DataFrame:
@@ -38,7 +37,7 @@ def worths_of(
     What is in the folder is kept. masked_settings: see `jobs.runs_of`; workers: `runner.run_all`.
     """
     sequences, sources = list(sequences), list(sources)
-    listed = jobs.worth_jobs(sequences, sources, width, numbers, with_controls, named)
+    listed = jobs.worth_jobs(sequences, sources, width, numbers, with_controls)
     runs = jobs.runs_of(listed, sequences, sources, masked_settings=masked_settings)
     return run_all(runs, folder, WORTH, **workers).table
 

@@ -88,7 +88,6 @@ def test_tables_made_from_tables_in_git_are_those_in_git():
     pairs = equal_number.table_of_pairs(
         write_texts.read_table(f"{write_texts.REAL}few_keypoints_runs"),
         write_texts.read_table(f"{write_texts.REAL}runs"),
-        write_texts.read_table(f"{write_texts.REAL}new_streets")["sequence"].unique(),
     )
     table = (folder / "equal_number.md").read_text(encoding="utf-8")
     assert table.startswith(style.markdown(pairs)) and note in table

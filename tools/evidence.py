@@ -16,7 +16,6 @@ import numpy as np
 import pandas as pd
 
 from keypoint_study import comparisons, jobs, ratios, runner, typical_worth
-from keypoint_study.methods import EXPLORED, IN_PLACE, METHODS
 from keypoint_study.report import style, texts
 from keypoint_study.report import worths as report_worths
 from keypoint_study.sources import Source
@@ -40,12 +39,6 @@ KEPT = (
     "budget",
 )
 NEW_STREETS = ("03", "04", "drive0009")  # docs/reading-results.md has their rule
-# whether it is the boundaries: masks and exact boundaries over what lies in mirrored places
-MIRRORED = (
-    ("masked", "mirrored"),
-    ("exact-boundaries", "mirrored-exact"),
-    ("exact-boundaries", "mirrored"),
-)
 RUNS = ("runs", "shuffled_runs", "ablations")  # tables of runs in the build folder
 # What the sequences show at their start: 00 to 10 are KITTI odometry's, the others raw drives.
 STREETS = {
@@ -97,7 +90,6 @@ def write(settings, folder):
             settings.build / "worth",
             (typical_worth.DECIDING, 0, 200, 100),
             processes=settings.jobs,
-            named=tuple(EXPLORED),
         ),
         "refined estimator, every width": lambda: runs_of_widths(settings, sequences, labels),
     }
@@ -157,19 +149,12 @@ def write(settings, folder):
 def judge(folder, note):
     """Write the tables and the figure of the worths in worth_runs.csv, judged by their check."""
     worths = pd.read_csv(folder / "worth_runs.csv", dtype={"sequence": str})
-    told = not_explored(worths)
     for artefact in (
-        report_worths.figure_of_worths(told),
-        report_worths.table_of_worths(told, NEW_STREETS),
+        report_worths.figure_of_worths(worths),
+        report_worths.table_of_worths(worths, NEW_STREETS),
     ):
         style.save(artefact, folder, note)
-    for_readers = {
-        "in_place": table_of_places(worths),
-        "left_out": table_of_classes(worths),
-        "new_streets": table_of_new_streets(worths),
-    }
-    for name, rows in for_readers.items():
-        style.save_table(rows, folder, name, note)
+    style.save_table(table_of_new_streets(worths), folder, "new_streets", note)
 
 
 @style.applied()
@@ -257,29 +242,6 @@ def table_of_widths(runs):
         failed = ratios.has_failed(of_width.set_index("sequence"))
         rows.append(row | {"streets that fail": ratios.count_failing(failed)})
     return pd.DataFrame(rows)
-
-
-def not_explored(worths):
-    """Return the worths of the choices that every study has."""
-    return worths[~worths["choice"].isin([method.title for method in EXPLORED.values()])]
-
-
-def table_of_places(worths):
-    """Return what masks tell, what mirrored ones and keypoints beside them tell, and the ratios."""
-    titles = {name: METHODS[name].title for name in METHODS}
-    of_masks = ["masked", "exact-boundaries", "mirrored"]
-    shown = [titles[name] for name in (*of_masks, *IN_PLACE)]
-    pairs = [*MIRRORED, *((name, f"beside-{name}") for name in of_masks)]
-    divided = [typical_worth.over(worths, titles[name], titles[other]) for name, other in pairs]
-    chosen = worths[worths["choice"].isin(shown) & (worths["number"] == typical_worth.DECIDING)]
-    decisive = [rows[rows["number"] == typical_worth.DECIDING] for rows in divided]
-    return report_worths.table_of_worths(pd.concat([chosen, *decisive]), NEW_STREETS).content
-
-
-def table_of_classes(worths):
-    """Return what random keypoints tell without those on one class."""
-    titles = [method.title for name, method in EXPLORED.items() if name not in IN_PLACE]
-    return report_worths.table_of_worths(worths[worths["choice"].isin(titles)], NEW_STREETS).content
 
 
 def table_of_new_streets(worths):

@@ -244,9 +244,8 @@ def equal(chosen: str, other: str, estimator: str = "refined") -> dict[str, Any]
     few_runs, runs = read_table(f"{REAL}few_keypoints_runs"), read_table(f"{REAL}runs")
     sides = equal_number.of_pair(few_runs, runs, (chosen, other), estimator)
     of_streets = equal_number.over(*sides)
-    new = read_table(f"{REAL}new_streets")["sequence"].unique()
     typical = {name: ratios.typical_ratio(of_streets[name]) for name in of_streets}
-    hangs = equal_number.hangs_on(of_streets, new)
+    hangs = equal_number.hangs_on(of_streets)
     failed = [streets(equal_number.failing(side)) for side in sides]
     return {**typical, "hangs": hangs, "failing": failed}
 

@@ -47,6 +47,7 @@ DAYS = {
     "2011-09-30": ("04", "05", "06", "07"),
     "2011-10-03": ("00", "01", "02"),
 }
+NEW = ("03", "04", "drive0009")  # streets on which nothing was chosen
 HARD = ("01", "05", "07")  # streets whose hard cases the refined estimator was developed on
 
 
@@ -79,12 +80,12 @@ def word(of_streets: pd.DataFrame, ends: tuple[str, str] = ("low", "high")) -> s
     return verdict(ERROR, len(of_streets), sides)
 
 
-def hangs_on(of_streets: pd.DataFrame, new: Collection[str]) -> dict[str, Any]:
+def hangs_on(of_streets: pd.DataFrame) -> dict[str, Any]:
     """Return the verdict on both errors, and where it is another one.
 
-    of_streets: of `over`. new: streets on which nothing was chosen.
+    of_streets: of `over`.
     {verdict; one, two, day: (number of cases left out without a change, number of cases); old: the
-    verdict without the new streets; easy: without HARD; student: with Student's t}
+    verdict without NEW; easy: without HARD; student: with Student's t}
     """
     streets, told = list(of_streets.index), word(of_streets)
 
@@ -97,7 +98,7 @@ def hangs_on(of_streets: pd.DataFrame, new: Collection[str]) -> dict[str, Any]:
         "one": stays([[street] for street in streets]),
         "two": stays([*combinations(streets, 2)]),
         "day": stays([*DAYS.values()]),
-        "old": word(of_streets.drop([*set(new) & set(streets)])),
+        "old": word(of_streets.drop([*set(NEW) & set(streets)])),
         "easy": word(of_streets.drop([*set(HARD) & set(streets)])),
         "student": word(of_streets, ("mean_low", "mean_high")),
     }
@@ -109,7 +110,7 @@ def failing(runs: pd.DataFrame) -> str:
     return ratios.count_failing(failed.set_axis(runs["sequence"]))
 
 
-def table_of_pairs(few: pd.DataFrame, runs: pd.DataFrame, new: Collection[str]) -> pd.DataFrame:
+def table_of_pairs(few: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
     """Return one row a pair and estimator, for readers."""
     lines = []
     for pair in [*PAIRS, (MASKS, EVERY)]:
@@ -122,7 +123,7 @@ def table_of_pairs(few: pd.DataFrame, runs: pd.DataFrame, new: Collection[str]) 
                 line[error] = (
                     f"{texts.short(typical)}, {typical['above']} of {typical['n']} above 1"
                 )
-            found = hangs_on(of_streets, new)
+            found = hangs_on(of_streets)
             line["both errors"] = found["verdict"]
             for case in ("one", "two", "day"):
                 name = {"one": "any one street", "two": "any two", "day": "a day"}[case]
@@ -179,7 +180,6 @@ def figure_of_choices(few: pd.DataFrame) -> Figure:
 def write(read: Callable[[str], pd.DataFrame], folder: Any, note: str) -> None:
     """Write the table and the figure into a folder. read: of a table in it, by name."""
     few, runs = read("few_keypoints_runs"), read("runs")
-    new = read("new_streets")["sequence"].unique()
-    style.save_table(table_of_pairs(few, runs, new), folder, "equal_number", note)
+    style.save_table(table_of_pairs(few, runs), folder, "equal_number", note)
     with style.applied():
         style.save_figure(figure_of_choices(few), folder, "equal_number", note)

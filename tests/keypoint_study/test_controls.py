@@ -16,7 +16,6 @@ from keypoint_study.sources import Source
 from thesis import section_4_2
 from thesis.ablations import boundaries
 from thesis_repro import masks
-from thesis_repro.data.cityscapes import ID
 from thesis_repro.data.sequence import Sequence
 from thesis_repro.masks import folders
 from thesis_repro.odometry import THESIS, keypoints
@@ -35,7 +34,7 @@ def made(sequence, small_labels):
     """Masks of every control and of the thesis, by method."""
     source = Source(small_labels)
     by_method = {"masked": folders.LabelMasks(small_labels / "00", sequence, WIDTH)}
-    for method in set(methods.MASK_CONTROLS) - set(methods.EXPLORED):
+    for method in methods.MASK_CONTROLS:
         _, by_method[method] = methods.METHODS[method].choose(Asked(sequence, source))
     return by_method
 
@@ -85,25 +84,17 @@ def test_a_control_keeps_as_many_pixels_as_the_masks(made, name):
     assert shares == pytest.approx(expected, abs=0.01)
 
 
-orb_on_masks = methods.found_by(keypoints.orb, methods.masked)
-
-
-def test_a_methods_own_settings_win_and_nothing_joins_a_study_unasked(
-    sequence, small_labels, monkeypatch
-):
-    own = methods.Method("ORB on masks", methods.CONTROL, orb_on_masks, methods.IF_NAMED)
+def test_a_methods_own_settings_win_over_those_of_a_study(sequence, small_labels, monkeypatch):
+    orb_on_masks = methods.found_by(keypoints.orb, methods.masked)
+    own = methods.Method("ORB on masks", methods.CONTROL, orb_on_masks)
     monkeypatch.setitem(methods.METHODS, "orb-on-masks", own)
     monkeypatch.setattr(jobs, "MASK_CONTROLS", [*methods.MASK_CONTROLS, "orb-on-masks"])
     source, few = Source(small_labels), {"detector": keypoints.spread(200)}
-    for named in ((), ("orb-on-masks",)):
-        planned = first_jobs([sequence], {"thesis": (WIDTH,)}, tested=WIDTH, named=named)
-        runs = runs_of(planned, [sequence], [source], {"scale_gate": 0.5}, few)
-        settings = {job.method: run.settings for job, run in runs.items()}
-        assert set(named) == {"orb-on-masks"} & set(settings)
-        listed = worth_jobs([sequence], [source], WIDTH, named=named)
-        chosen = runs_of(listed, [sequence], [source], masked_settings=few)
-        worth = {job.method: run.settings for job, run in chosen.items()}
-        assert set(named) == {"orb-on-masks"} & set(worth)
+    planned = first_jobs([sequence], {"thesis": (WIDTH,)}, tested=WIDTH)
+    runs = runs_of(planned, [sequence], [source], {"scale_gate": 0.5}, few)
+    settings = {job.method: run.settings for job, run in runs.items()}
+    chosen = runs_of(worth_jobs([sequence], [source], WIDTH), [sequence], [source], {}, few)
+    worth = {job.method: run.settings for job, run in chosen.items()}
     assert settings["masked"].detector == keypoints.spread(200)
     assert settings["orb-on-masks"] == replace(THESIS, detector=keypoints.orb, scale_gate=0.5)
     assert worth["orb-on-masks"].detector is keypoints.orb
@@ -150,62 +141,6 @@ def test_random_keypoints_on_a_mask_are_keypoints_there_drawn_again_alike(sequen
     assert 0 < len(rows) <= 20
     assert {*zip(columns, rows)} < {*map(tuple, found.tolist())}
     assert np.array_equal(drawn[3], drawn[3]) and not np.array_equal(drawn[3], drawn[2])
-
-
-def test_mirrored_exact_boundaries_are_exact_ones_in_a_mirror(sequence, small_labels):
-    asked = Asked(sequence, Source(small_labels))
-    exact, mirrored = (
-        methods.METHODS[name].choose(asked)[1][3] for name in ("exact-boundaries", "mirrored-exact")
-    )
-    assert np.array_equal(mirrored, exact[:, ::-1]) and mirrored.any()
-
-
-def explored(name, sequence, small_labels, index=3):
-    """The frame and keypoints of a method that a study has to name, and its mask."""
-    settings, given = methods.METHODS[name].choose(Asked(sequence, Source(small_labels)))
-    frame, mask = sequence.frame(index), given[index]
-    return frame, settings.detector(frame, settings, mask), mask
-
-
-@pytest.mark.parametrize("name, on", [("spread-on", True), ("spread-off", False)])
-def test_keypoints_are_spread_on_or_off_the_masks(name, on, sequence, small_labels, made):
-    _, points, _ = explored(name, sequence, small_labels)
-    columns, rows = points.astype(int).T
-    assert (
-        len(points) == methods.FEW_SPREAD and ((made["masked"][3][rows, columns] > 0) == on).all()
-    )
-
-
-def test_keypoints_beside_masks_are_near_them_and_none_is_taken_twice(sequence, small_labels):
-    frame, points, mask = explored("beside-masked", sequence, small_labels)
-    columns, rows = points.astype(int).T
-    on = detect(frame, THESIS, mask)
-    assert 50 < len(points) <= len(on) and (mask[rows, columns] == 0).all()
-    assert len(np.unique(points, axis=0)) == len(points)
-    distances = np.linalg.norm(points[:, None] - on, axis=2)
-    assert distances.min(axis=1).max() <= controls.NEIGHBOURHOOD
-    # the strongest keypoint has the nearest one of all off the mask
-    columns, rows = (everything := detect(frame, THESIS)).astype(int).T
-    off = everything[mask[rows, columns] == 0]
-    nearest = np.linalg.norm(off - on[0], axis=1).min()
-    assert nearest > controls.NEIGHBOURHOOD or distances[0, 0] == nearest
-
-
-def test_a_class_is_left_out(sequence, small_world, small_labels):
-    frame, points, _ = explored("without-road-and-sidewalk", sequence, small_labels)
-    path = small_world / "kitti/sequences/00/labels_0/000003.png"
-    true = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-    everything = detect(frame, THESIS)
-    # label maps have a fourth of the frame's columns, so borders of classes are left out here
-    ids = [ID["road"], ID["sidewalk"]]
-    near, inside = (
-        kind(np.isin(true, ids).astype(np.uint8), np.ones((9, 9)))
-        for kind in (cv2.dilate, cv2.erode)
-    )
-    columns, rows = points.astype(int).T
-    assert 0 < len(points) < len(everything) and not inside[rows, columns].any()
-    columns, rows = everything.astype(int).T
-    assert len(points) >= (near[rows, columns] == 0).sum()
 
 
 def test_random_lines_and_image_edges_cover_as_much_as_the_mask(sequence, made):

@@ -51,7 +51,7 @@ TABLES = {
     ),
     "thesis_repro/odometry/keypoints.py": (("(orb, ", "(orb, mine, "),),
     "keypoint_study/methods.py": (
-        ("METHODS = {", "METHODS = {'mine': Method('mine', CONTROL, all_keypoints, IF_NAMED),"),
+        ("METHODS = {", "METHODS = {'mine': Method('mine', CONTROL, all_keypoints, {}),"),
     ),
 }
 

@@ -8,7 +8,6 @@ from keypoint_study import ratios, verdicts
 from thesis import equal_number
 
 STREETS = sorted(street for streets in equal_number.DAYS.values() for street in streets)
-NEW = ("03", "04", "drive0009")
 
 
 def table(of_street):
@@ -18,7 +17,7 @@ def table(of_street):
 
 
 def test_a_verdict_of_all_streets_hangs_on_none():
-    found = equal_number.hangs_on(table({}), NEW)
+    found = equal_number.hangs_on(table({}))
     assert found == {
         "verdict": verdicts.HIGHER,
         "one": (11, 11),
@@ -32,13 +31,13 @@ def test_a_verdict_of_all_streets_hangs_on_none():
 
 def test_a_verdict_that_hangs_on_streets_says_so():
     """Two streets of one day hold against all others, so one pair and one day decide."""
-    found = equal_number.hangs_on(table({"05": 0.5, "06": 0.55}), NEW)
+    found = equal_number.hangs_on(table({"05": 0.5, "06": 0.55}))
     assert found["verdict"] == found["old"] == verdicts.NO_CLEAR_DIFFERENCE
     assert (found["one"], found["two"], found["day"]) == ((11, 11), (54, 55), (2, 3))
 
 
 def test_fewer_than_six_streets_tell_nothing():
-    found = equal_number.hangs_on(table({}).iloc[:5], NEW)
+    found = equal_number.hangs_on(table({}).iloc[:5])
     assert found["verdict"] == verdicts.TOO_FEW and found["one"] == (5, 5)
 
 

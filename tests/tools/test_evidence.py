@@ -41,9 +41,7 @@ TABLES = {
     "table_4_2": lambda: of_the_thesis("rmse"),
     "table_4_3": lambda: of_the_thesis("mae"),
     "refined_widths": lambda: evidence.table_of_widths(runs("refined_widths_runs")),
-    "worth": lambda: worths.table_of_worths(evidence.not_explored(runs("worth_runs"))).content,
-    "in_place": lambda: evidence.table_of_places(runs("worth_runs")),
-    "left_out": lambda: evidence.table_of_classes(runs("worth_runs")),
+    "worth": lambda: worths.table_of_worths(runs("worth_runs")).content,
     "new_streets": lambda: evidence.table_of_new_streets(runs("worth_runs")),
     "every_second": lambda: few_keypoints.table_of_few(
         few_keypoints.ratios_to_all(runs("every_second_runs"))

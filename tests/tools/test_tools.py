@@ -85,8 +85,6 @@ def test_evidence_keeps_what_shows_no_frame(executed, tmp_path, monkeypatch):
         "refined_widths",
         "refined_widths_runs",
         "few_keypoints_runs",
-        "in_place",
-        "left_out",
         "new_streets",
         *(f"figure_4_{number}" for number in range(13, 17)),
         *evidence.KEPT,

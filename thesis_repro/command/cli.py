@@ -172,20 +172,18 @@ def study(options: Any) -> int:
         all_widths = WIDTHS if mask_settings.has_width else ()
         widths = widths.union(*options.widths or [all_widths])
     names = dict.fromkeys(layout.locate(options.kitti, name).name for name in options.sequences)
-    tested, named = _controls(options.controls)
     planned = Study(
         options.kitti.absolute(),
         tuple(names or kitti.sequences(options.kitti)),
         sources.named(options.sources, mask_settings, options.invert, options.ids),
         tuple(sorted(widths)),
-        tested,
+        options.controls,
         tuple(dict.fromkeys(options.estimator)),
         options.repetitions,
         options.frames,
         options.scale_gate,
         {"detector": detector} if (detector := _detector(options)) else {},
         options.without_border,
-        named,
     )
     planned.check()
     folder = options.folder.absolute()
@@ -268,24 +266,6 @@ def _text(record: dict[str, Any], sequence: Any, speed: float | None) -> str:
         for flag, count in record["flagged"].items()
     ]
     return "\n".join(lines)
-
-
-def _controls(given: list[int | str] | None) -> tuple[int | None, tuple[str, ...]]:
-    """The width of the masks that --controls tests, and the names of further controls."""
-    from keypoint_study.jobs import CONTROL_WIDTH
-    from keypoint_study.methods import MASK_CONTROLS
-
-    if given is None:
-        return None, ()
-    widths = [each for each in given if isinstance(each, int)]
-    names = tuple(each for each in given if isinstance(each, str))
-    unknown = set(names) - set(MASK_CONTROLS)
-    if unknown or len(widths) > 1:
-        raise InputError(
-            f"--controls {' '.join(map(str, given))}: takes one width and names of controls, "
-            f"{', '.join(MASK_CONTROLS)}"
-        )
-    return (widths or [CONTROL_WIDTH])[0], names
 
 
 def _detector(options: Any) -> Any:

@@ -362,11 +362,11 @@ COMMANDS: dict[str, dict[str, Any]] = {
             help="dilation widths of masks from label maps, in pixels, such as 5,10 (1-15)",
         ),
         "--controls": dict(
-            type=values.width_or_name,
-            nargs="*",
-            metavar="W|NAME",
-            help="run controls, too, for masks of width W (10), and those of these names that not every "
-            "study runs",
+            type=int,
+            nargs="?",
+            const=10,
+            metavar="W",
+            help="run controls, too, for masks of width W (10)",
         ),
         "--repetitions": dict(
             type=values.positive_whole_number,

@@ -30,11 +30,6 @@ def number_of_frames(text: str) -> int | None:
     return positive_whole_number(text)
 
 
-def width_or_name(text: str) -> int | str:
-    """Return the dilation width, pixels, in a text, or the text itself, a name."""
-    return int(text) if text.lstrip("-").isdigit() else text
-
-
 def list_of_widths(text: str) -> tuple[int, ...]:
     """Return the dilation widths, pixels, in a text such as "1-3,10", sorted."""
     chosen: set[int] = set()
