@@ -19,7 +19,6 @@ from street_world import drives, street, textures
 from thesis_repro.data import kitti, trajectories
 from thesis_repro.data.memory import FRAME_TIME
 from thesis_repro.running import provenance
-from thesis_repro.running.code_used import digest_of_code
 from thesis_repro.running.files import progress, write_png, write_text
 from thesis_repro.running.workers import open_pool
 
@@ -173,12 +172,8 @@ def write(
         "seed": seed,
     }
     with provenance.claimed(out):
-        provenance.stage(
-            out,
-            replace=replace,
-            code=digest_of_code(_pictures, _write_missing, _write_sequence_texts),
-            **parameters,
-        )
+        code = provenance.digest_of_code("street_world")
+        provenance.stage(out, replace=replace, code=code, **parameters)
         pictures = []
         for picture in _pictures(out, **parameters):
             benchmark = picture.image_path.relative_to(out).parts[0]

@@ -10,7 +10,7 @@ import argparse
 from pathlib import Path
 from typing import NamedTuple
 
-from thesis_repro import segmentation  # noqa: F401  sets what TensorFlow reads at its import
+from thesis_repro import segmentation  # sets what TensorFlow reads at its import
 
 # isort: split
 import albumentations as A
@@ -24,7 +24,6 @@ from keras import ops
 from street_world import dataset as world
 from thesis_repro.data import cityscapes
 from thesis_repro.running import files, program, provenance
-from thesis_repro.running.code_used import digest_of_code
 from thesis_repro.segmentation import augmentation, prediction, quality, training
 from thesis_repro.segmentation.unet import build_unet
 
@@ -218,7 +217,7 @@ def train(camvid, kitti_semantic, pseudo, folder):
     )
     optimizer.build(model.trainable_variables)
     made_from = {
-        "code": digest_of_code(build_unet),
+        "code": provenance.digest_of_code(*segmentation.CODE),
         "tool": provenance.digest_of_file(Path(__file__)),
         **provenance.versions("tensorflow", "keras"),
         "phases": [COMMON, LAST],

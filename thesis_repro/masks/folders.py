@@ -25,9 +25,10 @@ from thesis_repro.masks import (
     near_movable,
 )
 from thesis_repro.running import provenance
-from thesis_repro.running.code_used import digest_of_code
 from thesis_repro.running.files import listed, progress, read_unchanged, write_png
 
+# code that makes the masks of files
+CODE = ("thesis_repro/masks", "thesis_repro/data", "thesis_repro/running/files.py")
 ENDINGS = (".png", ".jpg", ".jpeg")  # of masks, in small or capital letters
 AREA = np.ones((5, 5), np.uint8)  # gray edges are narrower than one of a single gray value
 MAX_GRAY = 0.2  # share of a mask's pixels; label maps have more, edges of JPEG files less
@@ -107,7 +108,7 @@ def write_masks(masks: LabelMasks, folder: str | Path) -> None:
             **label_ids.record(masks.ids),
             dilation_width=masks.dilation_width,
             frames=provenance.digest_of_files(masks.frame_paths),
-            code=digest_of_code(masks),
+            code=provenance.digest_of_code(*CODE),
             **provenance.versions("opencv"),
         )
         for index, path in enumerate(progress(masks.paths, f"masks, width {masks.dilation_width}")):

@@ -13,6 +13,7 @@ import re
 import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -162,6 +163,21 @@ def _version(name: str) -> str:
         return metadata.version(name)
     except metadata.PackageNotFoundError:  # such as tensorflow-cpu
         return sys.modules[name].__version__
+
+
+@cache  # a process has loaded its code once
+def digest_of_code(*parts: str) -> str:
+    """Return one digest of the code in folders and files of the packages: "thesis_repro/masks".
+
+    Any edit there changes it, even of a comment: it may repeat too much, and misses nothing.
+    """
+    digest = hashlib.sha256()
+    for part in parts:
+        place = ROOT / part
+        for path in sorted(place.rglob("*.py")) if place.is_dir() else [place]:
+            name = path.relative_to(ROOT).as_posix()
+            digest.update(f"{name}:{digest_of_file(path)}\n".encode())
+    return digest.hexdigest()[:12]
 
 
 def digest_of_files(paths: Iterable[str | Path]) -> str:

@@ -47,6 +47,8 @@ for _name, _value in _variables.items():
 os.environ["KERAS_BACKEND"] = "tensorflow"  # the package calls TensorFlow itself
 os.environ["TF_USE_LEGACY_KERAS"] = "0"  # and Keras 3
 
+# code that makes label maps and trainings
+CODE = ("thesis_repro/segmentation", "thesis_repro/data", "thesis_repro/running/files.py")
 GPUS = "/dev/nvidiactl", "/dev/dxg"  # device files of NVIDIA's driver and of WSL 2
 
 

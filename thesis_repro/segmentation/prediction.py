@@ -17,7 +17,6 @@ from thesis_repro.data.cityscapes import read_image
 from thesis_repro.data.frames import white_level
 from thesis_repro.errors import InputError
 from thesis_repro.running import files, program, provenance
-from thesis_repro.running.code_used import digest_of_code
 from thesis_repro.segmentation import training
 
 SIZE = 320  # height and width of written label maps, pixels
@@ -94,7 +93,7 @@ def write_label_maps(
             "frames": provenance.digest_of_files(paths),
             "batch_size": batch_size,  # the arithmetic may round differently for another one
             **provenance.versions("tensorflow", "keras", "opencv"),
-            "code": digest_of_code(write_label_maps, training.load_model),
+            "code": provenance.digest_of_code(*segmentation.CODE),
             "arithmetic": segmentation.arithmetic(),
         }
         if scale != 1:

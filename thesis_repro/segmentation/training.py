@@ -21,7 +21,6 @@ from thesis_repro import segmentation
 from thesis_repro.data.cityscapes import CLASS_WEIGHTS, N_CLASSES
 from thesis_repro.errors import InputError
 from thesis_repro.running import files, program, provenance
-from thesis_repro.running.code_used import digest_of_code
 from thesis_repro.segmentation import augmentation, keras_2
 from thesis_repro.segmentation.exact import same_bits
 
@@ -173,7 +172,7 @@ def made_from(model: Any, batches: Batches, validation: Batches) -> dict[str, An
     predicted = random.dirichlet(np.ones(N_CLASSES), true.shape[:3]).astype(np.float32)
     arrays = [array for pair in (*batches.sets, *validation.sets) for array in pair]
     return {
-        "code": digest_of_code(Batches, ResumableTraining, fused_loss, load_model),
+        "code": provenance.digest_of_code(*segmentation.CODE),
         **provenance.versions("tensorflow", "keras", "albumentations"),
         "arithmetic": segmentation.arithmetic(),
         "network": zlib.crc32(json.dumps(model.get_config(), default=str).encode()),
