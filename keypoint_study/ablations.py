@@ -9,7 +9,6 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
-from thesis_repro import masks
 from thesis_repro.data.cityscapes import ID
 from thesis_repro.data.sequence import Sequence
 from thesis_repro.masks.folders import LabelMasks
@@ -19,21 +18,11 @@ from thesis_repro.odometry.loop import detect, normalise, track
 VEGETATION = (ID["vegetation"], ID["terrain"])
 
 
-def nearest(label_masks: LabelMasks, width: int, index: int) -> np.ndarray:
-    """Return a mask from a label map that is enlarged by nearest neighbour."""
-    return masks.dilate(cv2.Canny(enlarged(label_masks, index), *masks.CANNY), width)
-
-
 def without_vegetation(label_masks: LabelMasks, index: int) -> np.ndarray:
     """Return the whole frame but trees and bushes (Section 5.2.2)."""
-    is_left_out = np.isin(enlarged(label_masks, index), VEGETATION)
-    return np.where(is_left_out, np.uint8(0), np.uint8(255))
-
-
-def enlarged(label_masks: LabelMasks, index: int) -> np.ndarray:
-    """Return the label map of a frame in the frame's size, by OpenCV's nearest neighbour."""
     label_map = label_masks.label_map(index)
-    return cv2.resize(label_map, label_masks.size[::-1], interpolation=cv2.INTER_NEAREST)
+    enlarged = cv2.resize(label_map, label_masks.size[::-1], interpolation=cv2.INTER_NEAREST)
+    return np.where(np.isin(enlarged, VEGETATION), np.uint8(0), np.uint8(255))
 
 
 @lru_cache(maxsize=2)  # several masks of one frame use it

@@ -8,7 +8,6 @@ not what helps. A new method is a function and an entry in METHODS.
 
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import replace
-from functools import lru_cache
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -22,7 +21,6 @@ from thesis_repro.data.sequence import Sequence
 from thesis_repro.masks import MaskSettings
 from thesis_repro.odometry import THESIS, OdometrySettings
 from thesis_repro.odometry.keypoints import filled, filtered, orb, spread
-from thesis_repro.odometry.loop import detect
 
 # Pixels: the dilation width of Section 3.6 and Figures 3.6 and 4.5, at which masks are tested, and
 # the width of lines and edges as controls. It was fixed before any run. (The code of appendix A.8
@@ -65,37 +63,18 @@ def masked(asked: Asked) -> Choice:
 
 
 def strongest(choose: Callable[[Asked], Choice]) -> Callable[[Asked], Choice]:
-    """Return a method with the strongest keypoints of another one alone.
-
-    There are as many as masks leave, if nobody says how many.
-    """
+    """Return a method with the strongest keypoints of another one alone."""
 
     def limited(asked: Asked) -> Choice:
         settings, masks = choose(asked)
-        number = number_left(asked) if asked.number is None else asked.number
-        return (replace(settings, max_keypoints=number) if number else settings), masks
+        return (replace(settings, max_keypoints=asked.number) if asked.number else settings), masks
 
     return limited
 
 
-def at_most(number: int) -> Callable[[Asked], Choice]:
-    """Return a method with a number of the strongest keypoints."""
-    return lambda asked: (replace(THESIS, max_keypoints=number), None)
-
-
 def drawn(asked: Asked) -> Choice:
-    """Run with as many random keypoints as are asked for, or as masks leave."""
-    number = number_left(asked) if asked.number is None else asked.number
-    return THESIS, MadeMasks(ablations.random_keypoints, asked.sequence, (number,))
-
-
-@lru_cache(maxsize=2)
-def number_left(asked: Asked) -> int:
-    """Return how many keypoints the masks of the source leave, from some frames."""
-    sequence, (_, masks) = asked.sequence, masked(asked)
-    some_frames = range(0, len(sequence), max(1, len(sequence) // 8))
-    numbers = [len(detect(sequence.frame(index), THESIS, masks[index])) for index in some_frames]
-    return max(1, round(np.mean(numbers)))  # OpenCV takes 0 as "no limit"
+    """Run with as many random keypoints as are asked for."""
+    return THESIS, MadeMasks(ablations.random_keypoints, asked.sequence, (asked.number,))
 
 
 def spread_out(asked: Asked) -> Choice:
@@ -228,7 +207,6 @@ METHODS = {  # in the order in which they are shown
     "keypoints": Method("own keypoints", OWN, all_keypoints, {STUDY: {ALL}, WORTH: {ALL, EACH}}),
     "paths": Method("path of another system", OWN, all_keypoints, {STUDY: {ALL}}),
     "filter": ablation(found_by(filtered, masked)),
-    "nearest": ablation(altered(ablations.nearest, CONTROL_WIDTH)),
     "symmetric": ablation(with_masks(symmetric=True)),
     "no-vegetation": ablation(altered(ablations.without_vegetation)),
     # the worth draws so many of them
@@ -237,9 +215,9 @@ METHODS = {  # in the order in which they are shown
         "strongest keypoints",
         REFERENCE,
         strongest(all_keypoints),
-        {FEW: {EACH}, WORTH: {DECIDING}, ABLATIONS: {AS_MANY}},
+        {FEW: {EACH}, WORTH: {DECIDING}},
     ),
-    "random": Method("random ones", REFERENCE, drawn, {FEW: {EACH}, ABLATIONS: {AS_MANY}}),
+    "random": Method("random ones", REFERENCE, drawn, {FEW: {EACH}}),
     "spread-anywhere": Method(
         "spread keypoints", REFERENCE, spread_out, {FEW: {EACH}, WORTH: {EACH}}
     ),
@@ -275,8 +253,6 @@ METHODS = {  # in the order in which they are shown
 PARALLAX = {"parallax-1": (1, np.inf), "parallax-3": (3, np.inf), "parallax-20": (0, 20)}
 METHODS |= {
     "dropout": ablation(of_sequence(ablations.random_keypoints, 0.9)),
-    # a twentieth, a tenth and a fifth of the thesis's 2000
-    **{f"strongest-{few}": ablation(at_most(few)) for few in (100, 200, 400)},
     **{
         prefix + name: ablation(of_sequence(make, *span))
         for name, span in PARALLAX.items()

@@ -275,19 +275,11 @@ def of_ablations(runs: pd.DataFrame) -> list[dict[str, Any]]:
     )
     measurements = [
         *_of_shuffles(runs),
-        *over(
-            "10",
-            "label map enlarged by nearest neighbours over bilinearly",
-            run("nearest"),
-            masks,
-            BOTH,
-        ),
         *over("12", "symmetric dilation over the thesis's", run("symmetric"), masks, BOTH),
         over_thesis("13", "inliers vote over all points vote, all keypoints", every, "inliers"),
         over_thesis("13", "inliers vote over all points vote, masks", masks, "inliers"),
         over_raw("all keypoints, aligned over raw", every, "se3"),
         over_raw("all keypoints, aligned and scaled over raw", every, "sim3"),
-        *over("28", "drawn at random over the strongest", run("random"), run("strongest"), BOTH),
         over_thesis("29", "refined over thesis's estimator, all keypoints", every, "refined"),
         over_thesis("29", "refined over thesis's estimator, masks", masks, "refined"),
         *(
@@ -297,13 +289,6 @@ def of_ablations(runs: pd.DataFrame) -> list[dict[str, Any]]:
         *(mean("29", "failed steps, masks", masks, "failed", "%", name) for name in COMPARED),
         mean("30", to_the_right, every, "across", "degrees", "refined"),
         mean("30", below, every, "down", "degrees", "refined"),
-        *over("34", "at most 100 keypoints over 2000", run("strongest-100"), every, BOTH),
-        *over("34", "at most 200 keypoints over 2000", run("strongest-200"), every, BOTH),
-        *over("34", "at most 400 keypoints over 2000", run("strongest-400"), every, BOTH),
-        *(
-            mean("34", "failed steps, 100 keypoints", run("strongest-100"), "failed", "%", name)
-            for name in COMPARED
-        ),
         *over("42", "dropped afterwards over detected inside the mask", run("filter"), masks, BOTH),
         *over("48", "ORB over Shi-Tomasi", run("orb"), every, BOTH),
         *over("55", "half turned into over all keypoints", half, every, ["in_turns"]),

@@ -103,7 +103,7 @@ def test_a_methods_own_settings_win_over_those_of_a_study(sequence, small_labels
     assert worth["strongest"] == replace(THESIS, max_keypoints=400)
 
 
-@pytest.mark.parametrize("place, count", [(methods.ABLATIONS, 21), (methods.FEW, 7)])
+@pytest.mark.parametrize("place, count", [(methods.ABLATIONS, 15), (methods.FEW, 7)])
 def test_ablations_and_few_keypoints_are_those_of_the_one_table(place, count):
     assert len(methods.compared_in(place)) == count
 
@@ -210,10 +210,9 @@ def test_every_ablation_differs_from_its_reference_in_one_thing(small_world, sma
     assert np.array_equal(thesis_masks[0], expected[0])
     dropped, same = runs["filter"]
     assert dropped.detector is keypoints.filtered and same is thesis_masks
-    for method in ("nearest", "symmetric"):
-        _, method_masks = runs[method]
-        assert not np.array_equal(method_masks[0], thesis_masks[0])
-        assert 0.5 < method_masks[0].sum() / thesis_masks[0].sum() < 2
+    _, method_masks = runs["symmetric"]
+    assert not np.array_equal(method_masks[0], thesis_masks[0])
+    assert 0.5 < method_masks[0].sum() / thesis_masks[0].sum() < 2
     label_map = cv2.imread(str(small_labels / "00" / sequence.frame_paths[0].name), 0)
     enlarged = cv2.resize(label_map, sequence.size[::-1], interpolation=cv2.INTER_NEAREST)
     _, method_masks = runs["no-vegetation"]

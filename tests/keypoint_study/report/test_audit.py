@@ -65,8 +65,7 @@ def test_ablations_become_ratios_of_their_reference():
     factors = {
         "baseline": 1.0,
         "masked": 0.5,
-        "nearest": 0.25,
-        "strongest-100": 4.0,
+        "symmetric": 0.25,
         "dropout": 1.0,
     }
     runs = made_up.runs(
@@ -82,8 +81,8 @@ def test_ablations_become_ratios_of_their_reference():
         ["row", "metric", "estimator"]
     )["value"]
     assert (
-        ratios["10", "RMSE", "refined"] == pytest.approx(0.5, rel=0.05)
-        and ratios["10", "keypoints", ""] == 1
+        ratios["12", "RMSE", "refined"] == pytest.approx(0.5, rel=0.05)
+        and ratios["12", "keypoints", ""] == 1
     )
     assert ratios["59", "RMSE", "thesis"] == pytest.approx(1, rel=0.05)
     assert set(measurements["frames"]) == {100}
