@@ -23,6 +23,7 @@ from numba.core.registry import cpu_target
 from numba.extending import is_jitted
 
 from opencv_exact.compiling import compiled, is_on_disk
+from opencv_exact.points import as_points, refuse_umat
 
 # Numba inlines these before LLVM sees them. Inlined by LLVM, most loops would stay scalar.
 inlined = partial(compiled, inline="always", no_cpython_wrapper=True)
@@ -109,11 +110,13 @@ def track(
 
     Pyramids of the last two frames that nobody can change (`frame.setflags(write=False)`) are kept.
     One thread is used, without Python's lock.
-    Raises ValueError for first guesses.
+    Raises ValueError for first guesses, and for points that OpenCV refuses.
     """
     if nextPts is not None or flags & cv2.OPTFLOW_USE_INITIAL_FLOW:
         raise ValueError("track: first guesses (nextPts, OPTFLOW_USE_INITIAL_FLOW) are not served")
-    points = np.asarray(prevPts, np.float32).reshape(-1, 2)
+    refuse_umat("prevImg", prevImg)
+    refuse_umat("nextImg", nextImg)
+    points = as_points("prevPts", prevPts, np.float32)
     steps = int(np.clip(criteria[1], 0, 100)) if criteria[0] & USES_STEPS else 30
     epsilon = float(np.clip(criteria[2], 0, 10)) if criteria[0] & USES_EPSILON else 0.01
     are_gray = prevImg.ndim == nextImg.ndim == 2 and prevImg.dtype == nextImg.dtype == np.uint8

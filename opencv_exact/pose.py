@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 
 from opencv_exact.compiling import compiled, inlined
-from opencv_exact.ransac import as_pairs
+from opencv_exact.points import as_pairs
 
 MAX_DEPTH = 50.0  # in lengths of the translation; as in cv2.recoverPose, farther points do not vote
 # for homogeneous points of unit norm; points nearer to a limit are left to OpenCV
@@ -25,8 +25,9 @@ def recover_pose(
     point four times with a singular value decomposition. Here a few steps of inverse iteration
     decide how nearly all points vote, for both signs of the translation at once. OpenCV's
     triangulation decides only about points close to a limit.
+    Raises ValueError for points that OpenCV refuses.
     """
-    current, previous = as_pairs(points1), as_pairs(points2)
+    current, previous = as_pairs(points1, points2)
     first, second, translation = cv2.decomposeEssentialMat(E)
     motions = [
         (first, translation),

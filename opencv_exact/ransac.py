@@ -26,6 +26,7 @@ import numpy as np
 from opencv_exact import epipolar, lucas_kanade
 from opencv_exact.compiling import compiled, inlined, is_on_disk
 from opencv_exact.five_point import SAMPLE_SIZE
+from opencv_exact.points import as_pairs
 from opencv_exact.real_roots import LANES
 from opencv_exact.solver import correspondences, solve
 
@@ -88,14 +89,15 @@ def find_essential_matrix(
     The arguments are OpenCV's, but only normalised coordinates and RANSAC are served. points1,
     points2: correspondences (N, 2) or (N, 1, 2). E: 3x3, or OpenCV's stack of solutions for N = 5,
     or None. mask: (N, 1) uint8, or None.
-    Raises ValueError for another camera or method.
+    Raises ValueError for another camera or method, and for points that OpenCV refuses.
     """
-    if focal != 1 or tuple(pp) != (0, 0) or method != cv2.RANSAC:
+    # OpenCV's other signature has a camera matrix in place of `focal`
+    if np.ndim(focal) or focal != 1 or np.ravel(pp).tolist() != [0, 0] or method != cv2.RANSAC:
         raise ValueError(
             "find_essential_matrix: serves RANSAC on normalised coordinates, (pixel - pp) / focal, "
             "with the threshold divided by focal"
         )
-    current, previous = as_pairs(points1), as_pairs(points2)
+    current, previous = as_pairs(points1, points2)
     columns = np.empty((4, len(current)))
     columns[:2], columns[2:] = current.T, previous.T
     solution, max_abs = None, np.abs(columns).max(axis=1, initial=0.0)
@@ -107,11 +109,6 @@ def find_essential_matrix(
     if solution is None:
         return _opencv(current, previous, threshold, prob)
     return solution.matrix, solution.mask
-
-
-def as_pairs(points: np.ndarray) -> np.ndarray:
-    """Points (N, 2) or (N, 1, 2) as (N, 2) float64."""
-    return np.asarray(points, np.float64).reshape(-1, 2)
 
 
 def is_compiled() -> bool:
