@@ -29,7 +29,7 @@ export OMP_NUM_THREADS := $(firstword $(subst $(comma), ,$(OMP_NUM_THREADS)))
 endif
 unexport PYTHONHOME PYTHONDONTWRITEBYTECODE PYTHONSTARTUP JUPYTER_PATH CDPATH TF_USE_LEGACY_KERAS XLA_FLAGS TF_XLA_FLAGS
 
-.PHONY: help setup figures book notebooks page excerpts evidence worth-check timings pictures camvid test torture lint lab bench weights pins clean check-data
+.PHONY: help setup figures book notebooks page excerpts evidence timings pictures camvid test torture lint lab bench weights pins clean check-data
 help:
 	@echo "make figures     write every table and figure to figures/, from embedded data, or from KITTI=/path CITYSCAPES=/path"
 	@echo "                 (KITTI_SEMANTIC=/path: also test the label maps); size: PROFILE=smoke|lab|demo|thesis, or single:"
@@ -43,7 +43,6 @@ help:
 	@echo "make evidence    make figures PROFILE=thesis from KITTI=build/excerpts, and keep what shows no frame; from other"
 	@echo "                 frames, elsewhere (whole sequences take hours; FRAMES=00:0-129,04:0-37 takes parts of sequences)"
 	@echo "make timings     after make figures, or make evidence KITTI=build/excerpts: measure the times that their figures show"
-	@echo "make worth-check compare the worth of a keypoint with the truth, in the embedded world (some minutes)"
 	@echo "make bench       measure the relative cost of odometry and network (KITTI=/path), into build/bench.json"
 	@echo "make camvid      train the thesis's network at its size on CAMVID=/path, into figures/camvid (many hours; EPOCHS=10)"
 	@echo "make pictures    draw the pictures of real streets from KITTI=build/excerpts"
@@ -149,9 +148,6 @@ excerpts: setup
 evidence: setup
 	@THESIS_REPRO_PROFILE=thesis $(BIN)/python -m thesis.figures
 	@THESIS_REPRO_PROFILE=thesis $(BIN)/python tools/evidence.py
-	@$(BIN)/python tools/write_texts.py
-worth-check: setup
-	@$(BIN)/python tools/worth_check.py
 	@$(BIN)/python tools/write_texts.py
 timings: setup
 	@$(if $(KITTI),THESIS_REPRO_PROFILE=thesis) $(BIN)/python tools/timings.py

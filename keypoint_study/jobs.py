@@ -1,4 +1,4 @@
-"""The runs of a study, as a list of jobs: of paths, and of the worth of a keypoint.
+"""The runs of a study, as a list of jobs.
 
 Chapter 4 runs every sequence with all keypoints, with masks of each width and with a reduced number
 of keypoints. The controls test whether it is the segmentation that helps. Those without a mask need
@@ -15,19 +15,12 @@ from typing import Any, NamedTuple
 
 from keypoint_study.controls import recorded
 from keypoint_study.methods import (
-    ALTERED,
-    BROUGHT,
     CONTROL_WIDTH,
-    DECIDING,
     LABEL_MAPS,
     MASK_CONTROLS,
     METHODS,
-    REFERENCE,
-    WORTH,
     Asked,
     changed,
-    of_group,
-    with_numbers,
 )
 from keypoint_study.sources import UNMASKED, Source
 from thesis_repro.data.kitti import TRUE_LABELS
@@ -204,40 +197,6 @@ def mask_controls(source: Source, sequence: Sequence, width: int | None) -> dict
     if not (sequence.folder / TRUE_LABELS).is_dir():
         allowed.pop("true-labels", None)
     return allowed
-
-
-def worth_jobs(
-    sequences: Iterable[Sequence],
-    sources: Iterable[Source],
-    width: int | None,
-    numbers: Iterable[int] = (DECIDING,),
-    with_controls: bool = True,
-) -> list[Job]:
-    """Return the jobs of a study for `typical_worth.WORTH`, of one sequence after the other.
-
-    numbers: of keypoints that are drawn, see `methods.with_numbers`. with_controls: also altered
-    masks, and the controls of `mask_controls`.
-    """
-    pairs = with_numbers(WORTH, numbers)
-    jobs: list[Job] = []
-    for sequence in sequences:
-        widths: list[tuple[str, dict[str, int | None]]] = [("", dict.fromkeys(of_group(REFERENCE)))]
-        for source in sources:
-            own = width if source.has_width else None
-            of_source: dict[str, int | None] = dict.fromkeys(of_group(BROUGHT), own)
-            if source.kind in UNMASKED:
-                of_source = {source.kind: None}
-            elif with_controls:
-                of_source |= dict.fromkeys(of_group(ALTERED), own)
-                of_source |= mask_controls(source, sequence, width)
-            widths.append((source.name, of_source))
-        jobs += [
-            Job(sequence.name, name, of_source[name], number, source=source)
-            for source, of_source in widths
-            for name, number in pairs
-            if name in of_source
-        ]
-    return jobs
 
 
 def repeated(jobs: Iterable[Job], estimators: Iterable[str], repetitions: int) -> list[Job]:

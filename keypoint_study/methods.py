@@ -1,6 +1,6 @@
 """What is compared: one table of ways to choose keypoints, METHODS.
 
-Studies, tables of few keypoints, ablations and the worth select from it. Beside all keypoints and
+Studies, tables of few keypoints and ablations select from it. Beside all keypoints and
 masks, there are *controls*: masks and settings that leave as many keypoints as the masks of the
 segmentation, chosen differently. If the odometry gains as much from a control, the segmentation is
 not what helps. A new method is a function and an entry in METHODS.
@@ -151,12 +151,11 @@ def changed(own: OdometrySettings, changes: Mapping[str, Any]) -> OdometrySettin
 
 # Where a method is compared, and with how many keypoints
 
-# studies with controls; chapter 4, ablations and few keypoints of the notebooks; the worth
-STUDY, CHAPTER_4, ABLATIONS, FEW, WORTH = "study", "chapter 4", "ablations", "few", "worth"
-# all that it leaves; each number of a list; the number that decides on the worth; as many as masks
-# leave
-ALL, EACH, DECIDING, AS_MANY = 0, "each", 400, "as many"
-IN_STUDY: Mapping[str, Collection] = {STUDY: {ALL}, WORTH: {DECIDING}}
+# studies with controls; chapter 4, ablations and few keypoints of the notebooks
+STUDY, CHAPTER_4, ABLATIONS, FEW = "study", "chapter 4", "ablations", "few"
+# all that it leaves; each number of a list; as many as masks leave
+ALL, EACH, AS_MANY = 0, "each", "as many"
+IN_STUDY: Mapping[str, Collection] = {STUDY: {ALL}}
 ABLATION: Mapping[str, Collection] = {ABLATIONS: {ALL}}
 
 
@@ -200,34 +199,21 @@ METHODS = {  # in the order in which they are shown
         all_keypoints,
         {STUDY: {ALL}, ABLATIONS: {ALL}, FEW: {ALL}},
     ),
-    "masked": Method(
-        "masks", BROUGHT, masked, {STUDY: {ALL}, ABLATIONS: {ALL}, WORTH: {ALL, EACH}}
-    ),
+    "masked": Method("masks", BROUGHT, masked, {STUDY: {ALL}, ABLATIONS: {ALL}}),
     # these two as sources.KINDS has them
-    "keypoints": Method("own keypoints", OWN, all_keypoints, {STUDY: {ALL}, WORTH: {ALL, EACH}}),
+    "keypoints": Method("own keypoints", OWN, all_keypoints),
     "paths": Method("path of another system", OWN, all_keypoints, {STUDY: {ALL}}),
     "filter": ablation(found_by(filtered, masked)),
     "symmetric": ablation(with_masks(symmetric=True)),
     "no-vegetation": ablation(altered(ablations.without_vegetation)),
-    # the worth draws so many of them
-    "drawn": Method("random keypoints", REFERENCE, all_keypoints, {WORTH: {ALL, EACH}}),
-    "strongest": Method(
-        "strongest keypoints",
-        REFERENCE,
-        strongest(all_keypoints),
-        {FEW: {EACH}, WORTH: {DECIDING}},
-    ),
+    "strongest": Method("strongest keypoints", REFERENCE, strongest(all_keypoints), {FEW: {EACH}}),
     "random": Method("random ones", REFERENCE, drawn, {FEW: {EACH}}),
-    "spread-anywhere": Method(
-        "spread keypoints", REFERENCE, spread_out, {FEW: {EACH}, WORTH: {EACH}}
-    ),
+    "spread-anywhere": Method("spread keypoints", REFERENCE, spread_out, {FEW: {EACH}}),
     "strongest-on": Method(
-        "strongest on the masks", BROUGHT, strongest(masked), {FEW: {ALL, EACH}, WORTH: {DECIDING}}
+        "strongest on the masks", BROUGHT, strongest(masked), {FEW: {ALL, EACH}}
     ),
     "random-on": Method("random on the masks", BROUGHT, drawn_on_masks, {FEW: {FEW_SPREAD}}),
-    "filled": Method(
-        "masks, filled", ALTERED, found_by(filled(FILL), masked), {FEW: {ALL}, WORTH: {DECIDING}}
-    ),
+    "filled": Method("masks, filled", ALTERED, found_by(filled(FILL), masked), {FEW: {ALL}}),
     "exact-boundaries": Method(
         "exact class boundaries", LABEL_MAPS, with_masks(boundaries="exact", keep="boundaries")
     ),
@@ -276,15 +262,10 @@ def compared_in(place: str) -> list[str]:
     return [name for name, method in METHODS.items() if place in method.where]
 
 
-def of_group(group: str) -> list[str]:
-    """Return the names of the methods of a group."""
-    return [name for name, method in METHODS.items() if method.group == group]
-
-
 def with_numbers(place: str, numbers: Iterable[int]) -> list[tuple[str, int]]:
     """Return (method, number of keypoints) for each number, 0 for no limit, in a place.
 
-    Those that the place has with a number of their own, such as the deciding one, come last.
+    Those that the place has with a number of their own come last.
     """
     asked = {name: METHODS[name].where[place] for name in compared_in(place)}
     each = [

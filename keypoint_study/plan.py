@@ -9,7 +9,7 @@ from typing import Any
 
 import pandas as pd
 
-from keypoint_study import comparisons, jobs, runner, sources, typical_worth
+from keypoint_study import comparisons, jobs, runner, sources
 from keypoint_study.sources import Source
 from thesis_repro.data.sequence import Sequence
 from thesis_repro.errors import InputError
@@ -52,6 +52,11 @@ class Study:
     def check(self) -> None:
         """Raise InputError for the first problem with the settings, the sequences or the masks."""
         for sequence in self.opened:
+            if not sequence.has_truth:
+                raise InputError(
+                    f"{sequence.poses_path}: no such file; a study needs true poses, without them the "
+                    "odometry command runs"
+                )
             if len(sequence) < 3:
                 raise InputError(
                     f"{sequence.folder}: {len(sequence)} frames; a study needs 3 or more"
@@ -164,27 +169,6 @@ class Study:
                     lines.append(f"{file}: {reason}")
                     program.log.warning(lines[-1])
         return lines
-
-    def worths(
-        self, folder: Path, processes: int = 1, scheduler: str | None = None
-    ) -> pd.DataFrame | None:
-        """Return what a keypoint of each source is worth, without truth (`typical_worth`).
-
-        What is in the folder is kept. None if no source has masks or keypoints. With a tested
-        width, also of the controls.
-        """
-        if all(source.kind == "paths" for source in self.sources):
-            return None
-        return typical_worth.worths_of(
-            self.opened,
-            self.sources,
-            self.shown_width,
-            folder / "worth",
-            with_controls=self.tested is not None,
-            masked_settings=self.masked_settings,
-            processes=processes,
-            scheduler=scheduler,
-        )
 
     @property
     def shown_width(self) -> int | None:

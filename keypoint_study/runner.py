@@ -1,7 +1,7 @@
 """The one runner: it makes the runs that have no result yet, and the table of all runs.
 
-They run here or on a cluster. What is measured is a path (PATH) or a worth (`typical_worth.WORTH`).
-Each finished run is one CSV file, which is not made again. Errors are computed from these files.
+They run here or on a cluster. Each finished run is one CSV file, which is not made again. Errors
+are computed from these files.
 """
 
 import json

@@ -10,7 +10,6 @@ import thesis_repro as tr
 import write_texts
 from keypoint_study import verdicts
 from keypoint_study.report import style
-from keypoint_study.report import worths as report_worths
 from thesis import claims, equal_number
 from thesis_repro.odometry import metrics
 
@@ -82,9 +81,6 @@ def test_tables_made_from_tables_in_git_are_those_in_git():
     assert len(names) == len(set(names)) > 20 and {claim.word for claim in found} == set(
         claims.RULE
     )
-    checks = report_worths.table_of_checks().content
-    beside_truth = (write_texts.ROOT / "figures" / "worth_check.md").read_text(encoding="utf-8")
-    assert beside_truth.startswith(style.markdown(checks)) and write_texts.WORLD in beside_truth
     pairs = equal_number.table_of_pairs(
         write_texts.read_table(f"{write_texts.REAL}few_keypoints_runs"),
         write_texts.read_table(f"{write_texts.REAL}runs"),

@@ -29,7 +29,6 @@ from keypoint_study import comparisons
 from keypoint_study.jobs import CONTROL_WIDTH
 from keypoint_study.plan import Study
 from keypoint_study.report import comparison, style
-from keypoint_study.report import worths as report_worths
 from keypoint_study.sources import Source
 from thesis import domain_gap, timing
 from thesis.reported import REPORTED
@@ -203,7 +202,7 @@ def table_of_training(histories, patience):
 
 
 def streets(settings, labels, out, note):
-    """Compare masks from the label maps with all keypoints, and write both tables."""
+    """Compare masks from the label maps with all keypoints, and write the table."""
     names = tuple(kitti.sequences(settings.kitti))
     study = Study(
         settings.kitti,
@@ -217,8 +216,6 @@ def streets(settings, labels, out, note):
     table = comparisons.comparisons_of(study.run(folder, settings.jobs).table)
     over_all = table[(table["reference"] == "baseline") & (table["method"] == "masked")]
     style.save_table(comparison.table_of_ratios(comparison.all_of(over_all)), out, "streets", note)
-    worths = study.worths(folder, settings.jobs)
-    style.save(report_worths.table_of_worths(worths), out, note)
 
 
 def main(camvid, job="", trained=""):

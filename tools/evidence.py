@@ -3,9 +3,9 @@
 `make evidence KITTI=...` runs `make figures PROFILE=thesis` with all sequences of a KITTI folder
 and the label maps of the model in the package. Then this program copies the tables, the runs and
 the figures that show no frame of the data. It adds what the streets show, few keypoints, the same
-with every second frame, the worth of a keypoint, and the refined estimator with masks of every
-width. It says what is left. A stopped run resumes. The frames of the manifest (`make excerpts`) are
-written to figures/kitti_excerpts, other frames beside it.
+with every second frame, and the refined estimator with masks of every width. It says what is left.
+A stopped run resumes. The frames of the manifest (`make excerpts`) are written to
+figures/kitti_excerpts, other frames beside it.
 """
 
 import sys
@@ -15,9 +15,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from keypoint_study import comparisons, jobs, ratios, runner, typical_worth
+from keypoint_study import comparisons, jobs, ratios, runner
 from keypoint_study.report import style, texts
-from keypoint_study.report import worths as report_worths
 from keypoint_study.sources import Source
 from thesis import chapter4, excerpts, few_keypoints, section_4_2, timing
 from thesis.settings import read_settings
@@ -38,7 +37,6 @@ KEPT = (
     "audit",
     "budget",
 )
-NEW_STREETS = ("03", "04", "drive0009")  # docs/reading-results.md has their rule
 RUNS = ("runs", "shuffled_runs", "ablations")  # tables of runs in the build folder
 # What the sequences show at their start: 00 to 10 are KITTI odometry's, the others raw drives.
 STREETS = {
@@ -83,14 +81,6 @@ def write(settings, folder):
         ),
         "every second frame": lambda: runs_of_every_second(settings, sequences, labels),
         "their times": lambda: few_keypoints.time_steps(sequences[0], labels, few_folder),
-        "worth of a keypoint": lambda: typical_worth.worths_of(
-            sequences,
-            [Source(labels)],
-            jobs.CONTROL_WIDTH,
-            settings.build / "worth",
-            (typical_worth.DECIDING, 0, 200, 100),
-            processes=settings.jobs,
-        ),
         "refined estimator, every width": lambda: runs_of_widths(settings, sequences, labels),
     }
     made = []
@@ -99,7 +89,7 @@ def write(settings, folder):
         started = time.monotonic()
         made.append(make())
         print(f"{name}: done in {time.monotonic() - started:.0f} s", flush=True)
-    few_runs, second_runs, times, worths, of_widths = made
+    few_runs, second_runs, times, of_widths = made
     times = timing.recorded(settings, "few_keypoints", times)
     few = few_keypoints.ratios_to_all(few_runs)
     streets = _streets(sequences)
@@ -120,14 +110,12 @@ def write(settings, folder):
     tables = {name: _read(settings, name) for name in RUNS} | {
         "few_keypoints_runs": few_runs,
         "every_second_runs": second_runs,
-        "worth_runs": worths,
         "refined_widths_runs": of_widths,
     }
     for name, rows in tables.items():
         # six digits are enough: shuffling the matched points changes more
         text = rows.to_csv(index=False, lineterminator="\n", float_format="%.6g")
         write_text(folder / f"{name}.csv", text)
-    judge(folder, note)
     draw(folder)
     findings = needed(settings.figures / "findings.md", "08_results").read_text(encoding="utf-8")
     write_text(
@@ -143,18 +131,6 @@ def write(settings, folder):
             },
         ),
     )
-
-
-@style.applied()
-def judge(folder, note):
-    """Write the tables and the figure of the worths in worth_runs.csv, judged by their check."""
-    worths = pd.read_csv(folder / "worth_runs.csv", dtype={"sequence": str})
-    for artefact in (
-        report_worths.figure_of_worths(worths),
-        report_worths.table_of_worths(worths, NEW_STREETS),
-    ):
-        style.save(artefact, folder, note)
-    style.save_table(table_of_new_streets(worths), folder, "new_streets", note)
 
 
 @style.applied()
@@ -242,15 +218,6 @@ def table_of_widths(runs):
         failed = ratios.has_failed(of_width.set_index("sequence"))
         rows.append(row | {"streets that fail": ratios.count_failing(failed)})
     return pd.DataFrame(rows)
-
-
-def table_of_new_streets(worths):
-    """Return the worths, by fields, on the streets that nothing was chosen on: one row each."""
-    choices = ["random keypoints", "spread keypoints", "masks"]
-    rows = worths[worths["sequence"].isin(NEW_STREETS) & worths["choice"].isin(choices)]
-    rows = rows[(rows["split"] == "fields") & (rows["number"] == typical_worth.DECIDING)]
-    columns = ["sequence", "choice", "keypoints", "direction", "rotation"]
-    return rows[columns].round({"direction": 2, "rotation": 2}).sort_values(columns[:2])
 
 
 def _streets(sequences):

@@ -6,15 +6,12 @@ row of a table, and writes its numbers. Its only conditions are the outcomes of 
 
 import re
 from functools import cache
-from itertools import product
 from typing import Any
 
 import pandas as pd
 
-from keypoint_study import comparisons, ratios, typical_worth, verdicts, worth_check
-from keypoint_study import worth as worths
-from keypoint_study.report import style, texts
-from keypoint_study.report import worths as report_worths
+from keypoint_study import comparisons, ratios, verdicts
+from keypoint_study.report import texts
 from thesis import claims, equal_number, few_keypoints
 from thesis.settings import ROOT
 from thesis_repro.command import cli
@@ -28,7 +25,6 @@ WRITTEN |= {
     f"{name}.md.j2": ROOT / f"docs/{name}.md" for name in ("answer", "reading-results", "options")
 }
 REAL = "kitti_excerpts/"  # tables on real frames
-WORLD = "odometry: embedded world, 11 drives of 25 frames; label maps by the model in the package"
 # how the texts say a verdict on errors
 VERDICT_PHRASES = {
     verdicts.LOWER: "lower than",
@@ -93,54 +89,6 @@ def by_chance(estimator: str = "thesis") -> pd.Series:
     return rows.loc[rows["estimator"] == estimator, "factor"]
 
 
-def worth(
-    choice: str, motion: str, split: str = "fields", where: str = "", number: int = 400
-) -> dict[str, Any]:
-    """Return ratio, low, high, below, n and verdict of the worth of one of so many keypoints.
-
-    choice: as in the tables, or two, "masks / beside the masks", for the one divided by the other.
-    where: which streets, without the rule for new ones. of_fit: the verdict of the second measure.
-    """
-    rows = read_table(f"{REAL}worth_runs").query("number == @number")
-    first, _, other = choice.partition(" / ")
-    rows = typical_worth.over(rows, first, other) if other else rows.query("choice == @choice")
-    new = () if where else read_table(f"{REAL}new_streets")["sequence"]
-    rows = rows.query(where) if where else rows
-    (row,) = typical_worth.typical_worths(rows, new).to_dict("records")
-    name = f"{motion}_{split}"
-    ends = {end: row[f"{name}_{end}"] for end in ("low", "high", "below")}
-    of_fit = row.get("verdict_of_fit")
-    return {"ratio": row[name], **ends, "n": row["n"], "verdict": row["verdict"], "of_fit": of_fit}
-
-
-def factor_off(choice: str, number: int = 400) -> float:
-    """Return by what factor the worth of a choice is off in the embedded world."""
-    return worth_check.factor_off(choice, number)
-
-
-def checks_off() -> list[str]:
-    """Return which worths are too far off the truth for any word."""
-    factors = {key: worth_check.factor_off(*key) for key in worth_check.checks().index}
-    limit = verdicts.TOO_FAR[verdicts.LESS]
-    return [
-        f"{number} {choice}, {two(factor)}"
-        for (choice, number), factor in factors.items()
-        if factor > limit
-    ]
-
-
-def new_streets_disagree(choice: str) -> bool:
-    """Whether the new streets disagree with the others on a choice (`typical_worth`)."""
-    rows = read_table(f"{REAL}worth_runs").query("number == 400 and choice == @choice")
-    return typical_worth.new_disagree(rows, read_table(f"{REAL}new_streets")["sequence"])
-
-
-def on_new_streets(choice: str, motion: str) -> str:
-    """Return the worths of a choice on each of the new streets, by fields: "0.31, 0.40, 0.52"."""
-    rows = read_table(f"{REAL}new_streets").query("choice == @choice")
-    return ", ".join(map(two, rows[motion]))
-
-
 def few(
     choice: str,
     number: int,
@@ -175,15 +123,6 @@ def few(
 def streets(of: str) -> str:
     """Return "1" for "1 of 11"."""
     return of.split()[0]
-
-
-def worth_range(choice: str, number: int = 400) -> str:
-    """Return the least and the greatest typical worth, of both motions and kinds of halves."""
-    typical = [
-        worth(choice, motion, split, number=number)["ratio"]
-        for motion, split in product(worths.MOTIONS, worths.SPLIT)
-    ]
-    return f"{min(typical):.1f} to {max(typical):.1f}"
 
 
 def of_masks() -> pd.DataFrame:
@@ -293,11 +232,6 @@ FUNCTIONS = (
     verdict,
     of_controls,
     by_chance,
-    worth,
-    factor_off,
-    checks_off,
-    new_streets_disagree,
-    on_new_streets,
     few,
     of_few,
     of_rendered,
@@ -305,7 +239,6 @@ FUNCTIONS = (
     all_claims,
     book,
     equal,
-    worth_range,
     of_masks,
     equal_number.share_of_days,
     metres,
@@ -319,7 +252,6 @@ def write_tables() -> None:
     """Write the tables that are made from other tables in git, and their figure."""
     folder = ROOT / "figures" / REAL
     equal_number.write(lambda name: read_table(f"{REAL}{name}"), folder, data_note())
-    style.save(report_worths.table_of_checks(), ROOT / "figures", WORLD)
     write_text(folder / "claims.md", claims.text_of_claims(all_claims(), data_note()))
 
 

@@ -15,7 +15,7 @@ from keypoint_study import comparisons, runner
 from keypoint_study.jobs import ESTIMATOR_TITLES
 from keypoint_study.methods import CONTROL_WIDTH
 from keypoint_study.plan import RUNS, Study
-from keypoint_study.report import comparison, html, latex, style, worths
+from keypoint_study.report import comparison, html, latex, style
 from keypoint_study.report.findings import findings_of
 from keypoint_study.report.paths import figure_of_paths
 from keypoint_study.report.style import COLUMN_WIDTH, PAGE_WIDTH, Artefact
@@ -23,7 +23,7 @@ from keypoint_study.sources import KINDS, UNMASKED, FileMasks, Source, own_calls
 from thesis_repro import checks
 from thesis_repro.data.sequence import Sequence
 from thesis_repro.data.trajectories import write_kitti_poses, write_tum
-from thesis_repro.errors import InputError, one_line
+from thesis_repro.errors import one_line
 from thesis_repro.masks import MaskSettings
 from thesis_repro.masks.folders import LabelMasks
 from thesis_repro.odometry import THESIS, metrics
@@ -39,42 +39,22 @@ DRAWN = ("masked", "keypoints")  # methods of what a user brings that acts on fr
 def make(
     study: Study,
     folder: Path,
-    with_worth: bool = True,
     processes: int = 1,
     scheduler: str | None = None,
 ) -> int:
     """Run a study, and write its page and tables; what is in the folder is kept.
 
-    Says what it finds doubtful, and where the page is. Without any ground truth, only the worth of
-    keypoints is measured. Returns 1 if a run failed, otherwise 0.
+    Says what it finds doubtful, and where the page is. Returns 1 if a run failed, otherwise 0.
     """
     with provenance.claimed(folder):
         warnings = []
         for sequence, masks in shown_masks(study):
             warnings += program.warn(checks.input_warnings(sequence, masks))
-        if not any(sequence.has_truth for sequence in study.opened):
-            of_worths = study.worths(folder, processes, scheduler)
-            if of_worths is not None:  # otherwise the run says that the ground truth is missing
-                file = write_worths(study, of_worths, folder)
-                program.summary(f"no ground truth, so no errors; worth of keypoints: {file}")
-                return 0
         outcome = study.run(folder, processes, scheduler)
         runs = outcome.table
         study = replace(study, sequences=tuple(runs["sequence"].unique()))
         warnings += outcome.warnings + program.warn(_doubts(study, runs))
-        of_worths = None
-        with_runs = set(runs["source"])
-        measured = tuple(source for source in study.sources if source.name in with_runs)
-        try:
-            if with_worth:
-                program.log.info(
-                    "next is the worth of keypoints, which takes about as long as the runs "
-                    "(--without-worth leaves it out)"
-                )
-                of_worths = replace(study, sources=measured).worths(folder, processes, scheduler)
-        except InputError as error:  # the runs are there, so their page is written
-            warnings += program.warn([f"no worth of keypoints: {error}"])
-        page = write(study, runs, folder, warnings, of_worths)
+        page = write(study, runs, folder, warnings)
     made = f"{len(runs):,} runs, {len(outcome.reasons):,} failed"
     program.summary(f"{made}; open {page} in a browser", outcome.kept)
     return int(bool(outcome.reasons))
@@ -100,11 +80,10 @@ def write(
     runs: pd.DataFrame,
     folder: Path,
     warnings: Collection[str] = (),
-    of_worths: pd.DataFrame | None = None,
 ) -> Path:
     """Write the findings, figures, tables and page of a `Study` into a folder.
 
-    Returns the page's path. warnings: lines for the top of the page. of_worths: of `Study.worths`.
+    Returns the page's path. warnings: lines for the top of the page.
     """
     # `thesis-repro synthesize` leaves a record beside the KITTI folder of an embedded world
     embedded = "train_images" in (provenance.record(study.kitti.resolve().parent) or {})
@@ -122,7 +101,7 @@ def write(
     )
     saved = [(findings, style.save(findings, folder, note))]
     for width in (COLUMN_WIDTH, PAGE_WIDTH):
-        for figure in figures_of(study, runs, table, of_worths, folder, width):
+        for figure in figures_of(study, runs, table, folder, width):
             if width == COLUMN_WIDTH:
                 # a tight box would make it wider or narrower than the column
                 style.write_figure(
@@ -133,7 +112,7 @@ def write(
             style.write_figure(figure.content, folder / f"{figure.name}.pdf")
             files = style.save(figure, folder, note)
             saved.append((figure, [*files, f"{figure.name}.pdf", f"{figure.name}-column.pdf"]))
-    for shown, for_paper in tables_of(named, table, of_worths):
+    for shown, for_paper in tables_of(named, table):
         files = style.save(shown, folder, note)
         if files and for_paper is not None:
             text = latex.latex_of(shown, for_paper)
@@ -160,7 +139,6 @@ def figures_of(
     study: Study,
     runs: pd.DataFrame,
     table: pd.DataFrame,
-    of_worths: pd.DataFrame | None,
     folder: Path,
     width: float,
 ) -> Iterator[Artefact]:
@@ -175,38 +153,21 @@ def figures_of(
             yield comparison.figure_of_ratios(table, source, width)
     if runs["method"].isin(DRAWN).any():
         yield figure_of_sources(study, runs, width)
-    if of_worths is not None:
-        yield worths.figure_of_worths(of_worths, width=width)
     for sequence in study.opened:
         yield figure_of_sequence(study, runs, sequence, folder, width)
 
 
 def tables_of(
-    runs: pd.DataFrame, table: pd.DataFrame, of_worths: pd.DataFrame | None
+    runs: pd.DataFrame, table: pd.DataFrame
 ) -> Iterator[tuple[Artefact, pd.DataFrame | None]]:
     """Return the tables of a study, each with what a paper shows of it (None: nothing)."""
     errors = comparison.table_of_errors(table, runs)
     yield errors, errors.content
     widths = comparison.table_of_widths(runs)
     yield widths, widths.content
-    if of_worths is not None:
-        shown = worths.table_of_worths(of_worths)
-        yield shown, worths.for_paper(shown.content)
-        caption = "The worth of each choice on every sequence."
-        yield Artefact("worth_runs", "Every worth", caption, of_worths, True), None
     yield comparison.long_table_of_ratios(table), comparison.ratios_for_paper(table)
     caption = "Settings, errors, failed and flagged frames."
     yield Artefact("runs", "Every run", caption, runs.round(6), True), None
-
-
-@style.applied()
-def write_worths(study: Study, of_worths: pd.DataFrame, folder: Path) -> Path:
-    """Write the worths of a study without ground truth, which has no errors; return the table."""
-    note = one_line(f"KITTI folder {study.kitti.name}, without ground truth")
-    provenance.write_table(folder / "worth_runs.csv", of_worths)
-    for artefact in (worths.figure_of_worths(of_worths), worths.table_of_worths(of_worths)):
-        style.save(artefact, folder, note)
-    return folder / "worth.md"
 
 
 def write_paths(study: Study, runs: pd.DataFrame, folder: Path) -> None:

@@ -12,7 +12,7 @@ import trials
 
 import opencv_exact
 import thesis_repro as tr
-from keypoint_study import comparisons, jobs, runner, worth
+from keypoint_study import comparisons, jobs, runner
 from keypoint_study.report import comparison
 from keypoint_study.sources import Source
 from thesis_repro.command import cli
@@ -77,27 +77,24 @@ def of_command_line():
     return groups
 
 
-def of_tables(kitti, folder, monkeypatch, capsys):
+def of_tables(kitti, folder, capsys):
     """What programs read: the columns of tables and the keys of JSON."""
     sequence = tr.Sequence(kitti, "00")
     assert cli.main(["odometry", "--kitti", str(kitti), "--sequence", "00", "--json"]) == 0
     path, source = jobs.Job("00", "paths", source="mine"), Source(kitti / "poses", "paths", "mine")
     runs = runner.run_all(jobs.runs_of([path], [sequence], [source]), folder).table
     compared = comparisons.comparisons_of(pd.read_csv(RUNS).fillna({"source": ""}))
-    nothing = worth.Tracks(*np.zeros((3, 0, 2)), np.zeros(0, bool), 1.0)
-    monkeypatch.setattr(worth, "tracked", lambda *_: (nothing, {("mine", 0): nothing}))
     ratios = comparison.long_table_of_ratios(compared).content
     return {
         "odometry --json": {*json.loads(capsys.readouterr().out)},
         "runs.csv": {*runs},
         "runs/SEQUENCE/RUN.csv": {*pd.read_csv(folder / "00" / f"{path.name}.csv")},
         "ratios.csv": {*ratios} - {*comparisons.sequences_of(compared)},
-        "worth_runs.csv": {*worth.worth_of(sequence, {})},
     }
 
 
-def test_what_is_promised_is_what_is_recorded(tiny_kitti, tmp_path, monkeypatch, capsys):
-    now = of_python() | of_command_line() | of_tables(tiny_kitti, tmp_path, monkeypatch, capsys)
+def test_what_is_promised_is_what_is_recorded(tiny_kitti, tmp_path, capsys):
+    now = of_python() | of_command_line() | of_tables(tiny_kitti, tmp_path, capsys)
     record = recorded()
     assert {*now} == {*record}, ADVICE
     for group, names in now.items():

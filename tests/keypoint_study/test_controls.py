@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from keypoint_study import ablations, comparisons, controls, jobs, methods, runner
-from keypoint_study.jobs import first_jobs, runs_of, worth_jobs
+from keypoint_study.jobs import first_jobs, runs_of
 from keypoint_study.methods import Asked
 from keypoint_study.sources import Source
 from thesis import section_4_2
@@ -18,7 +18,7 @@ from thesis.ablations import boundaries
 from thesis_repro import masks
 from thesis_repro.data.sequence import Sequence
 from thesis_repro.masks import folders
-from thesis_repro.odometry import THESIS, keypoints
+from thesis_repro.odometry import THESIS, OdometrySettings, keypoints
 from thesis_repro.odometry.loop import detect
 
 WIDTH = 10
@@ -93,14 +93,11 @@ def test_a_methods_own_settings_win_over_those_of_a_study(sequence, small_labels
     planned = first_jobs([sequence], {"thesis": (WIDTH,)}, tested=WIDTH)
     runs = runs_of(planned, [sequence], [source], {"scale_gate": 0.5}, few)
     settings = {job.method: run.settings for job, run in runs.items()}
-    chosen = runs_of(worth_jobs([sequence], [source], WIDTH), [sequence], [source], {}, few)
-    worth = {job.method: run.settings for job, run in chosen.items()}
     assert settings["masked"].detector == keypoints.spread(200)
     assert settings["orb-on-masks"] == replace(THESIS, detector=keypoints.orb, scale_gate=0.5)
-    assert worth["orb-on-masks"].detector is keypoints.orb
-    assert worth["mirrored"].detector == keypoints.spread(200)
-    assert worth["filled"].detector == keypoints.filled(methods.FILL, keypoints.spread(200))
-    assert worth["strongest"] == replace(THESIS, max_keypoints=400)
+    assert settings["mirrored"].detector == keypoints.spread(200)
+    filled = methods.changed(OdometrySettings(detector=keypoints.filled(methods.FILL)), few)
+    assert filled.detector == keypoints.filled(methods.FILL, keypoints.spread(200))
 
 
 @pytest.mark.parametrize("place, count", [(methods.ABLATIONS, 15), (methods.FEW, 7)])

@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 from street import Street
 
-from keypoint_study import sources, worth
+from keypoint_study import sources
 from keypoint_study.plan import Study
 from keypoint_study.report import study_report as report
 from keypoint_study.sources import Source
@@ -31,10 +31,8 @@ def no_figures(monkeypatch):
 
 
 @pytest.fixture
-def street(tmp_path, monkeypatch):
+def street(tmp_path):
     """A root with the street of noise as sequences 00 and 01, and one mask for all frames."""
-    for name in ("MAX_STEPS", "SPLITS", "FITS"):  # the worth takes longest; it has its own tests
-        monkeypatch.setattr(worth, name, 1)
     street, root = Street(12), tmp_path / "kitti"
     projection = np.column_stack([street.intrinsics, np.zeros(3)]).ravel().tolist()
     for name in ("00", "01"):
@@ -195,13 +193,6 @@ def test_own_keypoints_have_controls_of_equal_number_and_their_flags_are_told(st
     number = runs.groupby("method")["mean_keypoints"].mean()
     assert set(runs.index) == {"baseline", "keypoints", "fewer", "spread"}
     assert number["fewer"] == pytest.approx(number["keypoints"], abs=1)
-
-
-def test_one_sequence_that_stands_removes_no_other_worth(street, capsys):
-    write_kitti_poses(street / "poses/01.txt", np.tile(np.eye(4), (12, 1, 1)))
-    code, out = study(street, "--masks", street.parent / "masks", "--frames", 6)
-    assert code == 0 and "sequence 01: no step of" in capsys.readouterr().err
-    assert set(pd.read_csv(out / "worth_runs.csv", dtype=str)["sequence"]) == {"00"}
 
 
 @pytest.mark.parametrize("form", [write_kitti_poses, lambda path, poses: write_tum(path, poses, T)])

@@ -12,7 +12,7 @@ import pytest
 import trials
 from evo.tools import file_interface
 
-from keypoint_study import runner, worth
+from keypoint_study import runner
 from keypoint_study.plan import Study
 from keypoint_study.report import study_report as report
 from keypoint_study.sources import Source
@@ -25,15 +25,6 @@ from thesis_repro.masks.folders import LabelMasks, write_masks
 from thesis_repro.running.files import write_png
 
 FRAMES = 4
-
-
-@pytest.fixture(scope="module", autouse=True)
-def few_splits():
-    """The worth takes longest; it has its own tests."""
-    with pytest.MonkeyPatch.context() as patched:
-        for name in ("SPLITS", "FITS"):
-            patched.setattr(worth, name, 1)
-        yield
 
 
 @pytest.fixture(scope="module")
@@ -180,7 +171,7 @@ def test_a_killed_study_resumes_and_ends_as_an_undisturbed_one(
     assert finished == {path: path.stat().st_mtime_ns for path in finished}
 
 
-def test_each_folder_of_label_maps_may_name_its_ids_and_the_worth_be_left_out(
+def test_each_folder_of_label_maps_may_name_its_ids(
     small_world, small_labels, tmp_path, monkeypatch
 ):
     monkeypatch.setattr(report, "figures_of", lambda *_: ())
@@ -194,11 +185,11 @@ def test_each_folder_of_label_maps_may_name_its_ids_and_the_worth_be_left_out(
     where = ["--kitti", small_world / "kitti", "--sequences", "00", "--frames", 4]
     sources = ["--labels", f"mine={tmp_path / 'train'}:train", "--labels", tmp_path / "7:00"]
     counts = ["--widths", 5, "--repetitions", 1, "--estimator", "thesis", "--jobs", 1]
-    words = [*where, *sources, *counts, "--without-worth", "--output", tmp_path / "out"]
+    words = [*where, *sources, *counts, "--output", tmp_path / "out"]
     assert main(["study", *map(str, words)]) == 0
     runs = pd.read_csv(tmp_path / "out" / "runs.csv", keep_default_na=False).set_index("source")
     assert list(runs.index) == ["", "mine", "7-00"]
-    assert (tmp_path / "out/index.html").is_file() and not (tmp_path / "out/worth.csv").exists()
+    assert (tmp_path / "out/index.html").is_file()
     assert runs.loc["mine", "rmse"] == runs.loc["7-00", "rmse"] != runs.loc["", "rmse"]
 
 
@@ -339,21 +330,12 @@ def test_a_sequence_named_like_a_column_of_the_tables_is_refused(tiny_kitti):
         study.check()
 
 
-def test_a_study_without_ground_truth_says_what_keypoints_are_worth(
-    small_world, masks, tmp_path, capsys
-):
+def test_a_study_without_true_poses_is_one_line(small_world, masks, tmp_path, capsys):
     folder = tmp_path / "kitti" / "sequences" / "00"
     folder.parent.mkdir(parents=True)
     folder.symlink_to(small_world / "kitti" / "sequences" / "00")
-    where = ["--kitti", tmp_path / "kitti", "--frames", 4, "--output", tmp_path / "out"]
-    words = ["study", *where, "--masks", f"mine={masks}", "--jobs", 1]
-    assert main(list(map(str, words))) == 0
-    table = pd.read_csv(tmp_path / "out" / "worth_runs.csv", dtype={"sequence": str})
-    assert {"random keypoints", "spread keypoints", "mine: masks"} < set(table["choice"])
-    assert (table["steps"] == 3).all() and (table[["rotation", "direction"]] > 0).all(axis=None)
-    shown = pd.read_csv(tmp_path / "out" / "worth.csv")
-    assert list(shown["choice"]) == list(table["choice"].unique())
-    assert (tmp_path / "out" / "worth.svg").is_file()
-    times = {path: path.stat().st_mtime_ns for path in (tmp_path / "out/worth").rglob("*.csv")}
-    assert main(list(map(str, words))) == 0  # reads what is there
-    assert times == {path: path.stat().st_mtime_ns for path in times} and len(times) > 3
+    words = ["--kitti", tmp_path / "kitti", "--output", tmp_path / "out", "--masks", masks]
+    assert main(["study", *map(str, words)]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert re.fullmatch(r"error: .*00.txt: no such file; a study needs true poses.*", line)
+    assert not (tmp_path / "out").exists()

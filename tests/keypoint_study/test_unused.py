@@ -9,8 +9,8 @@ from trials import copy_project
 
 pytestmark = pytest.mark.slow
 
-# The records of a run of each kind, and of the worth, of each copy of the packages in a process of
-# its own, which begins with what they import.
+# The records of a run of each kind, of each copy of the packages in a process of its own, which
+# begins with what they import.
 SHOW = """
 import json, os, sys
 from pathlib import Path
@@ -23,13 +23,12 @@ for copy in copies:
         continue
     os.chdir(copy)
     sys.path.insert(0, str(copy))
-    from keypoint_study import jobs, runner, typical_worth
+    from keypoint_study import jobs, runner
     from keypoint_study.sources import Source
     from thesis_repro.data.sequence import Sequence
 
     sequence, source = Sequence(world / "kitti", "00").subset(3), Source(labels)
     shown = {"runs": runner._versions(runner.PATH, sequence)["code"]}
-    shown["worth"] = runner._versions(typical_worth.WORTH, sequence)["code"]
     names = jobs.first_jobs([sequence], {"refined": (5,)}, tested=5)
     names.append(jobs.Job("00", "spread-anywhere", max_keypoints=100))
     for job, run in jobs.runs_of(names, [sequence], [source]).items():
@@ -58,13 +57,12 @@ TABLES = {
 
 # (file, an old and a new text, the records that change)
 CHANGES = [
-    ("thesis_repro/odometry/loop.py", "MIN_MATCHES = 5", "MIN_MATCHES = 6", "runs worth"),
-    ("thesis_repro/data/kitti_odometry.py", '"times.txt"', '"time.txt"', "runs worth"),
-    ("thesis_repro/odometry/refined/fit.py", "eq=False", "eq=True", "masked worth"),
+    ("thesis_repro/odometry/loop.py", "MIN_MATCHES = 5", "MIN_MATCHES = 6", "runs"),
+    ("thesis_repro/data/kitti_odometry.py", '"times.txt"', '"time.txt"', "runs"),
+    ("thesis_repro/odometry/refined/fit.py", "eq=False", "eq=True", "masked"),
     ("thesis_repro/odometry/keypoints.py", "middle = int(", "middle = round(", "spread-anywhere"),
     ("keypoint_study/controls.py", "flip(masks", "transpose(masks", "mirrored random-lines"),
     ("thesis_repro/masks/kinds.py", "2 * pixels + 1", "2 * pixels", "masked mirrored"),
-    ("keypoint_study/worth.py", "SPLITS, SEED = 12", "SPLITS, SEED = 13", "worth"),
 ]
 
 
@@ -102,5 +100,5 @@ def test_a_change_repeats_what_used_it_and_a_new_entry_nothing(small_world, smal
     for (file, _, _, repeated), after in zip(CHANGES, changed, strict=True):
         different = {name for name in before if before[name] != after[name]}
         assert set(repeated.split()) <= different, file
-        if file.endswith(("keypoints.py", "worth.py")):  # of one class or measure alone
+        if file.endswith("keypoints.py"):  # of one class alone
             assert different == set(repeated.split()), file

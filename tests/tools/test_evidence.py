@@ -8,7 +8,7 @@ import pytest
 import evidence
 import write_texts
 from keypoint_study import comparisons
-from keypoint_study.report import comparison, style, worths
+from keypoint_study.report import comparison, style
 from thesis import few_keypoints, section_4_2
 
 NUMBER = re.compile(r"-?\d+(?:\.\d+)?")
@@ -41,8 +41,6 @@ TABLES = {
     "table_4_2": lambda: of_the_thesis("rmse"),
     "table_4_3": lambda: of_the_thesis("mae"),
     "refined_widths": lambda: evidence.table_of_widths(runs("refined_widths_runs")),
-    "worth": lambda: worths.table_of_worths(runs("worth_runs")).content,
-    "new_streets": lambda: evidence.table_of_new_streets(runs("worth_runs")),
     "every_second": lambda: few_keypoints.table_of_few(
         few_keypoints.ratios_to_all(runs("every_second_runs"))
     ),

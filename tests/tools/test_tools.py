@@ -11,7 +11,7 @@ from executing import run_of
 import bench
 import evidence
 import train_shipped
-from keypoint_study import jobs, runner, typical_worth, worth
+from keypoint_study import jobs, runner
 from keypoint_study.sources import Source
 from thesis.settings import read_settings
 from thesis_repro.data.sequence import Sequence
@@ -68,8 +68,6 @@ def test_evidence_keeps_what_shows_no_frame(executed, tmp_path, monkeypatch):
     shutil.copytree(executed, tmp_path / "run", symlinks=True)
     settings = read_settings(run_of(tmp_path / "run"))
     out = tmp_path / "out"
-    monkeypatch.setattr(worth, "MAX_STEPS", 1)
-    monkeypatch.setattr(worth, "SPLITS", 1)
     monkeypatch.setattr(evidence.few_keypoints, "TIMED_RUNS", 1)
     monkeypatch.setattr(evidence.few_keypoints, "REPETITIONS", 1)
     monkeypatch.setattr(evidence.few_keypoints, "NUMBERS", (50, 200))
@@ -78,14 +76,11 @@ def test_evidence_keeps_what_shows_no_frame(executed, tmp_path, monkeypatch):
         "README",
         "streets",
         "few_keypoints",
-        "worth",
-        "worth_runs",
         "every_second",
         "every_second_runs",
         "refined_widths",
         "refined_widths_runs",
         "few_keypoints_runs",
-        "new_streets",
         *(f"figure_4_{number}" for number in range(13, 17)),
         *evidence.KEPT,
         *evidence.RUNS,
@@ -98,7 +93,7 @@ def test_evidence_keeps_what_shows_no_frame(executed, tmp_path, monkeypatch):
 @pytest.mark.torture
 @pytest.mark.parametrize("street", ["04"])
 def test_a_street_gives_the_evidence_in_git(kitti_real, tmp_path, street):
-    """From its frames: label maps, runs of both estimators, the worth of masks and random ones."""
+    """From its frames: label maps, runs of both estimators."""
     sequence = Sequence(kitti_real, street)
     folder = tmp_path / "labels" / street
     prediction.write_label_maps(prediction.load_shipped(), sequence.frame_paths, folder, 16)
@@ -110,18 +105,10 @@ def test_a_street_gives_the_evidence_in_git(kitti_real, tmp_path, street):
         for repetition in (0, 1)
     ]
     runs = runner.run_all(jobs.runs_of(planned, [sequence], [source]), tmp_path / "runs").table
-    asked = [
-        job
-        for job in jobs.worth_jobs([sequence], [source], 10)
-        if job.method in ("drawn", "masked")
-    ]
-    measured = jobs.runs_of(asked, [sequence], [source])
-    worths = runner.run_all(measured, tmp_path / "worth", typical_worth.WORTH).table
-    for name, made in ("runs", runs), ("worth_runs", worths):
-        text = made.to_csv(index=False, lineterminator="\n", float_format="%.6g")
-        whole = (evidence.FOLDER / f"{name}.csv").read_text(encoding="utf-8").splitlines()
-        head, *rows = text.splitlines()
-        assert head == whole[0] and len(rows) >= 6 and set(rows) <= set(whole)
+    text = runs.to_csv(index=False, lineterminator="\n", float_format="%.6g")
+    whole = (evidence.FOLDER / "runs.csv").read_text(encoding="utf-8").splitlines()
+    head, *rows = text.splitlines()
+    assert head == whole[0] and len(rows) >= 6 and set(rows) <= set(whole)
 
 
 def test_a_sweep_has_one_row_a_width():

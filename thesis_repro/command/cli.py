@@ -191,7 +191,7 @@ def study(options: Any) -> int:
     # this import takes seconds, so the input is checked first
     from keypoint_study.report import study_report
 
-    return study_report.make(planned, folder, not options.without_worth, options.jobs, options.dask)
+    return study_report.make(planned, folder, options.jobs, options.dask)
 
 
 COMMANDS = {

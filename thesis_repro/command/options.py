@@ -350,10 +350,6 @@ COMMANDS: dict[str, dict[str, Any]] = {
             "[NAME=]DIR",
             "folder with the path NN.txt of another system for each sequence, in KITTI's or TUM's format, metres",
         ),
-        "--without-worth": dict(
-            action="store_true",
-            help="leave out the worth of keypoints, which takes about as long as the runs",
-        ),
         "--widths": dict(
             type=values.list_of_widths,
             nargs="+",

@@ -53,20 +53,6 @@ def normal_equations(r, t, points, scale, with_derivatives):
     return cost, hessian, sums[5].copy()
 
 
-@compiled
-def gradients_of_groups(r, t, points, starts, scale):
-    """The gradient (5) of each group of points, (G, 5).
-
-    points: (4, N), group by group. starts: (G,), the place of the first point of each.
-    """
-    gradients = np.empty((len(starts), 5))
-    for group in range(len(starts)):
-        stop = starts[group + 1] if group + 1 < len(starts) else points.shape[1]
-        part = points[:, starts[group] : stop].copy()
-        gradients[group] = normal_equations(r, t, part, scale, True)[2]
-    return gradients
-
-
 @inlined
 def _write_residuals(essential, scale, rows, count):
     """Write residuals and weights of a block's points, and what their derivatives need."""
