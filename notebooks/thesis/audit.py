@@ -24,9 +24,6 @@ CALLED = {  # column of a table: its name in the audit
     "in_turns": "rotation error in turns",
     "on_straights": "rotation error on straights",
     "se3": "aligned ATE",
-    "residual": "distance of tracks from the true epipolar lines",
-    "fields": "fields of the frame with a keypoint",
-    "outliers": "tracks beyond PySLAM's threshold",
     "translation_percent": "translation error over 20 m",
     "rotation_deg_per_100m": "rotation error over 20 m",
 }
@@ -109,6 +106,6 @@ def clear_effects(table: pd.DataFrame) -> pd.DataFrame:
 
     Row 14, a largest over a smallest error, cannot be below 1 and is left out.
     """
-    no_errors = ["", CALLED["mean_keypoints"], CALLED["fields"]]
+    no_errors = ["", CALLED["mean_keypoints"]]
     lines = table[(table["unit"] == "ratio") & ~table["metric"].isin(no_errors)]
     return lines[((lines["low"] > 1) | (lines["high"] < 1)) & (lines["row"] != "14")]

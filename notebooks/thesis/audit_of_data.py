@@ -6,24 +6,17 @@ Rows of notebooks that were not run have no numbers.
 from pathlib import Path
 from typing import Any
 
-import albumentations as A
 import numpy as np
 import pandas as pd
 from cv2 import INTER_NEAREST, resize
 
-from keypoint_study.jobs import CONTROL_WIDTH
-from keypoint_study.methods import METHODS, Asked
-from keypoint_study.sources import Source
 from thesis import ablations, artefacts, audit_of_tables, domain_gap, earlier, timing
 from thesis.audit import measurement, ratio
 from thesis.audit_of_tables import TIME_OF_NARROW, TIME_TOGETHER, TIME_TYPICAL, WIDTHS
 from thesis.settings import Settings
-from thesis_repro.data import cityscapes
 from thesis_repro.data.cityscapes import ID, read_label_map
 from thesis_repro.data.kitti import TRUE_LABELS
 from thesis_repro.data.sequence import Sequence
-from thesis_repro.masks.folders import LabelMasks
-from thesis_repro.segmentation import augmentation, training
 
 SMALL = [ID[name] for name in ("pole", "traffic light", "traffic sign", "person")]
 SHADOW = (
@@ -39,21 +32,18 @@ def measurements_of_run(
     """Return the measurements of all rows that are not live, for `audit.audit_table`.
 
     drives: the sequences of the ablations. repetitions: of each ablation. pairs: of frames of each
-    sequence whose keypoints and boundaries are measured one by one. Writes ablations.csv.
+    sequence whose boundaries are measured. Writes ablations.csv.
     """
     labels = earlier.label_maps()
     ablated = ablations.run_ablations(
         drives, labels, settings.build / "audit", repetitions, settings.jobs
     )
     artefacts.write_text("ablations.csv", ablated.to_csv(index=False))
-    tracks = [ablations.tracks(drive, masks_by_name(drive, labels), pairs) for drive in drives]
     return [
         *audit_of_tables.of_shares(boundaries(drives, labels, pairs)),
         *audit_of_tables.of_ablations(ablated),
-        *audit_of_tables.of_tracks(pd.concat(tracks, ignore_index=True)),
         *audit_of_tables.of_shares(right_pixels(settings, drives, labels)),
         *of_earlier_notebooks(settings, len(drives)),
-        *(of_training(settings) if artefacts.is_trained() else []),
     ]
 
 
@@ -72,20 +62,6 @@ def boundaries(drives: list[Sequence], labels: Path, pairs: int) -> pd.DataFrame
             shares |= ablations.thin_boundaries(thin_map, drive.size)
             rows.append({"sequence": drive.name, "frame": index} | shares)
     return pd.DataFrame(rows)
-
-
-def masks_by_name(drive: Sequence, labels: Path) -> dict[str, Any]:
-    """Return the masks of a sequence that place keypoints differently, for `ablations.tracks`."""
-    own_folder, true_folder = labels / drive.name, drive.folder / TRUE_LABELS
-    by_name: dict[str, Any] = {
-        "all keypoints": [None] * len(drive),
-        "masks": LabelMasks(own_folder, drive, CONTROL_WIDTH),
-        "exact boundaries": LabelMasks(own_folder, drive, CONTROL_WIDTH, ablations.EXACT),
-        "random lines": METHODS["random-lines"].choose(Asked(drive, Source(labels)))[1],
-    }
-    if true_folder.is_dir():
-        by_name["true label maps"] = LabelMasks(true_folder, drive, CONTROL_WIDTH)
-    return by_name
 
 
 def right_pixels(settings: Settings, drives: list[Sequence], labels: Path) -> pd.DataFrame:
@@ -148,7 +124,7 @@ def of_earlier_notebooks(settings: Settings, count: int) -> list[dict[str, Any]]
 
 
 def of_times(settings: Settings) -> list[dict[str, Any]]:
-    """Return rows 16, 47 and 49, from the times that notebook 08 shows."""
+    """Return rows 16 and 47, from the times that notebook 08 shows."""
     seconds, stages = (timing.recorded(settings, name) for name in ("seconds", "budget"))
     of_each = {name: timing.time_savings(rows) for name, rows in seconds.groupby("sequence")}
     timed_on: dict[str, Any] = {"data": timing.told(seconds)}
@@ -169,40 +145,4 @@ def of_times(settings: Settings) -> list[dict[str, Any]]:
     timed_on = {"data": timing.told(stages)}
     text = "whole frame with masks and network over all keypoints"
     measurements.append(measurement("16", text, whole, "ratio", **timed_on))
-    for row in stages[stages["method"] != UNMASKED].sort_values("stage").itertuples():
-        time, stage = row.milliseconds, {"metric": row.stage, **timed_on}
-        measurements.append(measurement("49", "milliseconds a frame", time, "ms", **stage))
     return measurements
-
-
-def of_training(settings: Settings) -> list[dict[str, Any]]:
-    """Return rows 7 and 44, from the validation images and the network of notebook 04."""
-    earlier.images()
-    data = settings.build / "data"
-    model = artefacts.model_of_run()
-    model.compile(loss=training.total_loss())
-    images, label_maps = (np.load(data / f"validation_{x}.npy")[:16] for x in ("images", "labels"))
-    blur, full = (
-        augmentation.validation_augmenter(),
-        augmentation.training_augmenter(images.shape[1]),
-    )
-    blurred, transformed = (
-        [validation_loss(model, (images, label_maps), each, seed) for seed in range(2)]
-        for each in (blur, full)
-    )
-    history = pd.read_csv(settings.build / "model" / "history.csv")["val_loss"]
-    return [
-        measurement("7", "validation loss, blur alone", blurred),
-        measurement("7", "validation loss, all transforms", transformed),
-        measurement("44", "validation loss, last epoch", history.iloc[-1]),
-        measurement("44", "validation loss, best epoch", history.min()),
-    ]
-
-
-def validation_loss(
-    model: Any, held_out: tuple[np.ndarray, np.ndarray], transforms: A.Compose, seed: int
-) -> float:
-    """Return the loss of a network on an augmented copy of images with label maps."""
-    copies, maps = augmentation.augment_set(*held_out, transforms, seed)
-    encoded = augmentation.one_hot(maps, cityscapes.N_CLASSES)
-    return model.evaluate(copies.astype(np.float32), encoded, batch_size=4, verbose=0)

@@ -212,12 +212,10 @@ def of_study(runs: pd.DataFrame, shuffled: pd.DataFrame) -> list[dict[str, Any]]
         *over(
             "37", "boundaries of static classes alone, over masks", static_boundaries, masks, BOTH
         ),
-        *over("40", "as few of the strongest as masks leave, over all keypoints", few, every, BOTH),
         *over("50", "corrected masks over the thesis's", corrected, masks, BOTH),
         *over("50", "corrected masks over all keypoints", corrected, every, BOTH),
         *over("11", "exact boundaries over the thesis's masks", run("exact-boundaries"), masks),
         *over("26", "width 5 over width 10", run("masked", [5]), run("masked", [10]), BOTH),
-        *over("32", "true over predicted label maps", true_maps, masks),
         *over("33", "plainly reduced over all keypoints", run("reduced"), every),
         *over("33", "plainly reduced over masks of the best width", run("reduced"), best),
         *over("33", "as few of the strongest over masks", few, masks),
@@ -231,20 +229,13 @@ def of_study(runs: pd.DataFrame, shuffled: pd.DataFrame) -> list[dict[str, Any]]
 def _of_best_widths(
     runs: pd.DataFrame, best: pd.DataFrame, shuffled: pd.DataFrame
 ) -> list[dict[str, Any]]:
-    """Return rows 2, 31, 35 and 39. best: the runs with masks of each sequence's best width."""
+    """Return rows 2, 35 and 39. best: the runs with masks of each sequence's best width."""
     masked, every = comparisons.of_method(runs, "masked"), comparisons.of_method(runs, "baseline")
     stability = section_4_2.stability(masked, every)
-    by_width = masked.groupby(["sequence", "dilation_width"])[["rmse", "mae"]].mean()
-    chosen = by_width.groupby("sequence").idxmin()  # by either error
-    rmse_of = {error: by_width["rmse"][chosen[error]].to_numpy() for error in chosen}
-    other_width = (chosen["rmse"] != chosen["mae"]).sum()
     nine = section_4_2.best_widths(masked)["dilation_width"].isin(WIDTHS).sum()
     best_of = "masks of the best width over all keypoints"
-    by_both = "width chosen by MAE over width chosen by RMSE"
     return [
         ratio("2", f"{best_of}, same runs", ratios.ratios_of(best, every, "rmse"), metric="RMSE"),
-        ratio("31", by_both, rmse_of["mae"] / rmse_of["rmse"], metric="RMSE"),
-        measurement("31", "sequences with another best width by MAE", other_width, "sequences"),
         measurement("35", "sequences with a best width of 9 to 11", nine, "sequences"),
         ratio("2", f"{best_of}, other repetitions", stability["elsewhere"], metric="RMSE"),
         share("2", "pairs of repetitions with the same best width", stability["same_best"]),
@@ -270,9 +261,6 @@ def of_ablations(runs: pd.DataFrame) -> list[dict[str, Any]]:
     run = partial(of_method, runs)
     every, masks, half = run("baseline"), run("masked"), run("turned-into")
     no_trees = "no keypoints on vegetation and terrain, over all keypoints"
-    to_the_right, below = (
-        f"direction of motion {side} the true one" for side in ("to the right of", "below")
-    )
     measurements = [
         *_of_shuffles(runs),
         *over("12", "symmetric dilation over the thesis's", run("symmetric"), masks, BOTH),
@@ -287,8 +275,6 @@ def of_ablations(runs: pd.DataFrame) -> list[dict[str, Any]]:
             for name in COMPARED
         ),
         *(mean("29", "failed steps, masks", masks, "failed", "%", name) for name in COMPARED),
-        mean("30", to_the_right, every, "across", "degrees", "refined"),
-        mean("30", below, every, "down", "degrees", "refined"),
         *over("42", "dropped afterwards over detected inside the mask", run("filter"), masks, BOTH),
         *over("48", "ORB over Shi-Tomasi", run("orb"), every, BOTH),
         *over("55", "half turned into over all keypoints", half, every, ["in_turns"]),
@@ -328,33 +314,10 @@ def _of_parallax(text: str, name: str, runs: pd.DataFrame) -> list[dict[str, Any
     ]
 
 
-def of_tracks(tracks: pd.DataFrame) -> list[dict[str, Any]]:
-    """Return the lines of row 32 that follow from the table of `ablations.tracks`."""
-    every = of_method(tracks, "all keypoints")
-    columns = ("residual", "outliers", "fields")
-    measurements = []
-    for name, text in TRACKED.items():
-        rows = of_method(tracks, name)
-        measurements += over("32", f"{text} over all keypoints", rows, every, columns, [""])
-    return with_frames(measurements, tracks)
-
-
-TRACKED = {  # method of the table of tracks: what is measured
-    "masks": "masks",
-    "true label maps": "masks of true label maps",
-    "exact boundaries": "masks of exact boundaries",
-    "random lines": "random lines",
-}
 SHARES = {  # column of a table: row of the audit, what is measured
-    "invented": ("10", "pixels with an id of no class within 2 pixels"),
     "lost": ("11", "boundary pixels lost"),
-    "road/sidewalk": ("11", "boundary pixels lost, road/sidewalk"),
-    "vegetation/sky": ("11", "boundary pixels lost, vegetation/sky"),
-    "building/fence": ("11", "boundary pixels lost, building/fence"),
     "rim": ("65", "accuracy within a tenth of the frame's edges"),
     "inside": ("65", "accuracy further inside"),
-    "L2": ("71", "edge pixels of either kind that differ with the root of squares"),
-    "Gaussian": ("72", "edge pixels of either kind that differ with a Gaussian of 5x5"),
     "thin 5/15": ("87", "boundary pixels of poles and signs with an edge, thresholds 5 and 15"),
     "thin 20/60": ("87", "boundary pixels of poles and signs with an edge, thresholds 20 and 60"),
     "thin 40/120": ("87", "boundary pixels of poles and signs with an edge, thresholds 40 and 120"),
