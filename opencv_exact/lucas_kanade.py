@@ -108,7 +108,8 @@ def track(
     define, is 0. Frames of 8-bit gray and windows of 21x21 are tracked in lanes unless
     `reason_for_opencv` names a reason. OpenCV does the rest.
 
-    Pyramids of the last two frames that nobody can change (`frame.setflags(write=False)`) are kept.
+    Pyramids of the last two frames that nobody can change are kept: of arrays that own their memory
+    and are read-only (`frame.setflags(write=False)`).
     One thread is used, without Python's lock.
     Raises ValueError for first guesses, and for points that OpenCV refuses.
     """
@@ -195,7 +196,7 @@ def _has_avx2() -> bool:
 
 def _kept_pyramid(frame: np.ndarray, most_levels: int) -> Pyramid:
     """Pyramid of a frame; kept, if nobody can change the frame."""
-    if frame.flags.writeable:
+    if frame.flags.writeable or not frame.flags.owndata:
         return pyramid(frame, most_levels)
     global _kept
     kept = _kept  # another thread may change it

@@ -693,6 +693,7 @@ def test_runs_share_no_keypoints_if_a_setting_differs_that_may_matter(
         ("detector", keypoints.spread),
         ("max_keypoints", -1),
         ("threshold", 0.0),
+        ("quality", 0),
     ],
 )
 def test_wrong_settings_are_named(setting, value):
@@ -758,7 +759,46 @@ def test_wrong_sequences_and_masks_are_named_before_a_frame_is_read(drive, make)
     assert unread.read == []
 
 
-def test_masks_may_be_a_function_that_is_called_once_a_frame(drive):
+def test_frames_stay_the_callers_and_one_buffer_may_hold_them_all(drive):
+    """A decoder fills one array again; a camera hands out read-only views of one memory."""
+    images = [drive.frame(index).copy() for index in range(4)]
+    expected = odometry.run(Changed(drive, frames=4), SMALL).poses
+    memory = bytearray(images[0].size)
+    buffer = np.frombuffer(memory, np.uint8).reshape(images[0].shape)
+    view = np.frombuffer(memoryview(memory).toreadonly(), np.uint8).reshape(images[0].shape)
+
+    class Camera(Street):
+        scales, has_truth = drive.scales[:4], False
+        intrinsics = drive.intrinsics
+
+        def __init__(self, shown):
+            self.shown = shown
+
+        def __len__(self):
+            return 4
+
+        def frame(self, index):
+            buffer[:] = images[index]
+            return self.shown
+
+    for shown in (buffer, view, view[:]):
+        poses = [
+            odometry.run(Camera(shown), SMALL).poses,
+            odometry.run_many(Camera(shown), {"all": (SMALL, None)})["all"].poses,
+        ]
+        for each in poses:
+            np.testing.assert_array_equal(each, expected)
+    assert buffer.flags.writeable
+
+
+def test_a_float_mask_is_named_where_not_all_of_the_frame_is_visible(drive):
+    few = Changed(drive, frames=2)
+    few.visible = lambda index: np.full(drive.size, 255, np.uint8)
+    with pytest.raises(InputError, match="frame 0: the mask is float32"):
+        odometry.run(few, SMALL, masks=lambda index, frame: np.ones(frame.shape, np.float32))
+
+
+def test_masks_may_be_a_function_or_a_method_that_is_called_once_a_frame(drive):
     stripes, called = Stripes(40), []
 
     def mask_of(index, frame):
@@ -767,11 +807,16 @@ def test_masks_may_be_a_function_that_is_called_once_a_frame(drive):
         called.append(index)
         return stripes[index]
 
-    expected = odometry.run(drive, masks=stripes).poses
+    class Network:
+        def mask(self, index, frame):
+            return mask_of(index, frame)
+
+    expected, network = odometry.run(drive, masks=stripes).poses, Network()
     assert np.array_equal(odometry.run(drive, masks=mask_of).poses, expected)
     runs = {name: (THESIS, mask_of) for name in "ab"} | {"c": (THESIS, None)}
+    runs |= {name: (SMALL, network.mask) for name in "de"}
     results = odometry.run_many(drive, runs)
-    assert called == 2 * list(range(len(drive)))
+    assert sorted(called) == sorted(3 * list(range(len(drive))))
     assert np.array_equal(results["a"].poses, expected)
     assert not np.array_equal(results["c"].poses, expected)
 

@@ -30,7 +30,8 @@ def detect(
     global _latest
     latest = _latest  # another thread may change it
     if latest[0] is not frame:
-        latest = _latest = None if frame.flags.writeable else frame, {}
+        is_fixed = frame.flags.owndata and not frame.flags.writeable
+        latest = _latest = frame if is_fixed else None, {}
     corners, size = latest[1], settings.block_size
     if size not in corners:
         corners[size] = find_corners(frame, size)

@@ -56,7 +56,15 @@ def gray_frame(
             f"frame {number}: shape {frame.shape}, earlier frames {previous.shape}; "
             "all frames must have the same size"
         )
-    if frame.flags.writeable:  # the caller may read the next frame into the same array
+    return unchangeable(frame)
+
+
+def unchangeable(frame: np.ndarray) -> np.ndarray:
+    """Return a frame that nobody changes: a copy, unless it is read-only and owns its memory.
+
+    A caller may read the next frame into the same array, or a camera into the memory below a view.
+    """
+    if frame.flags.writeable or not frame.flags.owndata:
         frame = frame.copy()
         frame.setflags(write=False)
     return frame

@@ -4,6 +4,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence, Sized
 from dataclasses import dataclass
 from pathlib import Path
+from types import MethodType
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -12,7 +13,7 @@ import pandas as pd
 from thesis_repro.data.memory import SequenceLike
 from thesis_repro.data.trajectories import write_kitti_poses, write_tum
 from thesis_repro.errors import InputError
-from thesis_repro.odometry.inputs import EQUAL
+from thesis_repro.odometry.inputs import EQUAL, unchangeable
 from thesis_repro.odometry.loop import STATIONARY, Calls, Odometry
 from thesis_repro.odometry.settings import THESIS, OdometrySettings
 from thesis_repro.odometry.step import FRAME_COLUMNS, ROTATION_COLUMNS, TIMED_PARTS, Step
@@ -190,17 +191,17 @@ def run_many(
     step_lengths = sequence.scales
     rows: dict[Any, list[list]] = {name: [] for name in runs}
     for index in progress(range(len(sequence)), description):
-        frame = sequence.frame(index)
-        frame.setflags(write=False)  # so that all runs share it
+        frame = unchangeable(np.asarray(sequence.frame(index)))  # one array, which all runs share
         together.expect(frame, odometries.values())
         visible = sequence.visible(index)
-        made: dict[int, tuple] = {}  # of this frame, by the identity of its masks
+        made: dict[Any, tuple] = {}  # the masks of this frame
         for name, odometry in list(odometries.items()):
             masks = runs[name][1]
             try:
-                if id(masks) not in made:
-                    made[id(masks)] = _mask_of_frame(masks, index, frame, visible)
-                mask, mask_seconds = made[id(masks)]
+                source = _identity(masks)
+                if source not in made:
+                    made[source] = _mask_of_frame(masks, index, frame, visible)
+                mask, mask_seconds = made[source]
                 step = odometry.step(frame, step_lengths[index], mask)
             except InputError as error:
                 if failed is None:
@@ -211,6 +212,13 @@ def run_many(
             step.seconds = dict.fromkeys(TIMED_PARTS, np.nan)
             rows[name].append([*step.row().values(), mask_seconds])
     return {name: _result(sequence, rows[name], runs[name][0]) for name in odometries}
+
+
+def _identity(masks: Any) -> Any:
+    """What tells masks from others. Each mention of an object's method makes a new object."""
+    if isinstance(masks, MethodType):
+        return id(masks.__self__), masks.__func__
+    return id(masks)
 
 
 def _mask_of_frame(
@@ -231,7 +239,8 @@ def inside(visible: np.ndarray | None, mask: Any) -> Any:
     """A mask without what is not visible (see Sequence.visible); both may be None: everywhere."""
     if visible is None or mask is None:
         return visible if mask is None else mask
-    if np.shape(mask) != visible.shape:  # the odometry names it
+    mask = np.asarray(mask)
+    if mask.shape != visible.shape or mask.dtype not in (bool, np.uint8):  # the odometry names it
         return mask
     return mask & visible
 

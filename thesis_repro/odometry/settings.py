@@ -26,7 +26,7 @@ LIMITS = {
     "max_keypoints": (0, 2**31 - 1),
     "min_distance": (0, 10_000),
     "redetect_below": (0, 2**31 - 1),
-    "quality": (0, 1),
+    "quality": (1e-9, 1),
     "threshold": (1e-9, 1e9),
     "block_size": (1, 31),
     "window": (3, 101),
