@@ -5,7 +5,7 @@ estimator, repetition, frames, mean_keypoints, flagged, and one column for each 
 
 **Comparisons** (`comparisons_of`) have one row for each method, reference, metric and estimator:
 the ratio of the method's error to the reference's with its interval (`ratios`), a verdict
-(`verdicts.ERROR`), on how many sequences each fails, and the ratio of every sequence. The rows
+(`verdicts.ERROR`), on how many sequences each fails, and the ratios of the sequences. The rows
 that answer the main question are those that `decide`.
 
 The functions below it select parts of a table of runs.
@@ -37,7 +37,7 @@ BROUGHT = ("masked", *UNMASKED)  # methods of what a user brings; the others are
 METRIC_TITLES = {name: error.title for name, error in ERRORS.items()}
 JUDGING_METRICS = {name: error.title for name, error in ERRORS.items() if error.decides}
 
-# of `comparisons_of`, before those of the sequences
+# of `comparisons_of`
 COLUMNS = (
     "source",
     "method",
@@ -66,6 +66,7 @@ COLUMNS = (
     "more_failures",
     "fewer_failures",
     "failures_verdict",
+    "ratios",
 )
 
 USUAL_JUDGE = "refined"  # the estimator that decides, since shuffling changes it least
@@ -79,8 +80,8 @@ def comparisons_of(runs: pd.DataFrame) -> pd.DataFrame:
     compared with); metric, estimator; label (see `labels`); tested (whether the width is the
     `tested_width`); shown (whether it is that, or the source has no masks of that width); decides
     (whether the row is of the tested width, a judging metric and the `judging_estimator`); those of
-    `ratios.typical_ratio`; far_off (see `ratios.far_off`); verdict; those of `failures`; and one
-    column for each sequence with its ratio.
+    `ratios.typical_ratio`; far_off (see `ratios.far_off`); verdict; those of `failures`; and
+    ratios, {sequence: its ratio}.
     Masks help if both rows that decide are LOWER than with all keypoints. The segmentation helps if
     they are also LOWER than with each of SEGMENTATION_FREE_CONTROLS.
     An error that no sequence has with both methods has no row.
@@ -114,18 +115,13 @@ def comparisons_of(runs: pd.DataFrame) -> pd.DataFrame:
                     **typical,
                     "verdict": verdict(verdicts.ERROR, typical["n"], [side]),
                     **of_failures,
-                    **by_sequence,
+                    "ratios": dict(by_sequence),
                 }
                 rows.append(row)
-    table = pd.DataFrame(rows, columns=[*COLUMNS, *sorted(runs["sequence"].unique())])
+    table = pd.DataFrame(rows, columns=COLUMNS)
     masked = table[table["tested"].astype(bool) & (table["method"] == "masked")]
     table["shown"] = table["tested"] | ~table["source"].isin(masked["source"])
     return table
-
-
-def sequences_of(table: pd.DataFrame) -> list[str]:
-    """Return the names of the columns of `comparisons_of` with the ratio of each sequence."""
-    return list(table.columns[len(COLUMNS) :])
 
 
 def failures(failed: pd.Series, reference: pd.Series) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from typing import Any
 
 import pandas as pd
 
-from keypoint_study import comparisons, jobs, runner, sources
+from keypoint_study import jobs, runner, sources
 from keypoint_study.sources import Source
 from thesis_repro.data.sequence import Sequence
 from thesis_repro.errors import InputError
@@ -60,10 +60,6 @@ class Study:
             if len(sequence) < 3:
                 raise InputError(
                     f"{sequence.folder}: {len(sequence)} frames; a study needs 3 or more"
-                )
-            if sequence.name in comparisons.COLUMNS:
-                raise InputError(
-                    f"{sequence.folder}: has the name of a column of the tables; rename the sequence"
                 )
         widths = list(self.widths)
         if self.tested is not None:

@@ -83,7 +83,6 @@ def figure_of_ratios(table: pd.DataFrame, source: str = "", width: float = PAGE_
     is_wide = width > COLUMN_WIDTH
     if not is_wide:
         rows = rows[rows["estimator"] == comparisons.judging_estimator(rows)]
-    sequences = comparisons.sequences_of(table)
     orders = {name: list(part["label"].unique()) for name, part in rows.groupby("estimator")}
     estimators = [name for name in ESTIMATOR_TITLES if name in orders]
     metrics = [name for name in comparisons.JUDGING_METRICS if (rows["metric"] == name).any()]
@@ -102,10 +101,10 @@ def figure_of_ratios(table: pd.DataFrame, source: str = "", width: float = PAGE_
         width=width,
         height_ratios=heights,
     )
-    reach = _reach(rows, sequences)
+    reach = _reach(rows)
     for panel, (estimator, metric) in zip(axes.flat, shown, strict=True):
         of_panel = rows[(rows["estimator"] == estimator) & (rows["metric"] == metric)]
-        _draw_ratios(panel, of_panel, orders[estimator], sequences, reach)
+        _draw_ratios(panel, of_panel, orders[estimator], reach)
         panel.set_title(comparisons.METRIC_TITLES[metric])
     for panel, (estimator, _) in zip(axes[:, 0], shown[::columns], strict=True):
         panel.set_ylabel(ESTIMATOR_TITLES[estimator])
@@ -114,29 +113,31 @@ def figure_of_ratios(table: pd.DataFrame, source: str = "", width: float = PAGE_
     return Artefact(name, title, caption, figure)
 
 
-def _reach(rows: pd.DataFrame, sequences: list[str]) -> float:
+def _reach(rows: pd.DataFrame) -> float:
     """Return the largest ratio of the figure's axis."""
-    distances = rows[sequences].astype(float).map(np.log).abs()
-    brought = distances[rows["method"].isin(BROUGHT)].stack()
-    wide_enough = [
-        reach
-        for reach in REACHES
-        if (distances.stack() < np.log(reach)).mean() >= 0.9
-        and (brought < np.log(reach)).mean() >= 0.75
-    ]
-    return min(wide_enough, default=REACHES[-1])
+    every = _distances_from_one(rows)
+    brought = _distances_from_one(rows[rows["method"].isin(BROUGHT)])
+    for reach in REACHES:
+        limit = np.log(reach)
+        if (every < limit).mean() >= 0.9 and (brought < limit).mean() >= 0.75:
+            return reach
+    return REACHES[-1]
 
 
-def _draw_ratios(
-    panel: Axes, rows: pd.DataFrame, order: list[str], sequences: list[str], reach: float
-) -> None:
+def _distances_from_one(rows: pd.DataFrame) -> pd.Series:
+    """Return how far the ratios of all sequences are from 1, on logarithms."""
+    each = [ratio for of_row in rows["ratios"] for ratio in of_row.values()]
+    return np.log(pd.Series(each, dtype=float)).abs()
+
+
+def _draw_ratios(panel: Axes, rows: pd.DataFrame, order: list[str], reach: float) -> None:
     """Draw the ratios of one estimator and metric, each at the place of its label in `order`."""
     dot: dict[str, Any] = {"color": "#555555", "markersize": 4, "markeredgewidth": 0}
     edges = {1 / reach: ("<", "left"), reach: (">", "right")}
     for _, row in rows.iterrows():
         y = order.index(row["label"])
         color = MASKED if row["method"] == "masked" else BASELINE
-        values = row[sequences].dropna().astype(float)
+        values = pd.Series(row["ratios"])
         shown = values.clip(1 / reach, reach)
         inside = values[values == shown]
         ends = row[["low", "high"]].astype(float)
@@ -222,9 +223,11 @@ def ratios_for_paper(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def long_table_of_ratios(table: pd.DataFrame) -> Artefact:
-    """Return `comparisons_of` for programs."""
+    """Return `comparisons_of` for programs, with a column for each sequence."""
     title, caption = CAPTIONS["ratios"]
-    rows = table.assign(far_off=table["far_off"].map(" ".join))
+    rows = table.drop(columns="ratios").assign(far_off=table["far_off"].map(" ".join))
+    of_sequences = pd.DataFrame(list(table["ratios"]), index=table.index).sort_index(axis=1)
+    rows = pd.concat([rows, of_sequences], axis=1)
     return Artefact("ratios", title, caption, rows, for_programs=True)
 
 

@@ -81,10 +81,9 @@ def _result(label: str, pair: pd.DataFrame, deciding: pd.DataFrame) -> dict[str,
         & (deciding["reference_source"] == pair["source"].iloc[0])
     ]
     of_controls = [comparisons.verdict_of(rows) for _, rows in over_controls.groupby("reference")]
-    sequences = comparisons.sequences_of(deciding)
     without = []
     for _, row in pair[pair["far_off"].map(len) > 0].iterrows():
-        left = ratios.typical_ratio(row[sequences].drop(row["far_off"]).dropna())
+        left = ratios.typical_ratio(pd.Series(row["ratios"]).drop(row["far_off"]))
         error = comparisons.METRIC_TITLES[row["metric"]]
         without.append(f"without {', '.join(row['far_off'])}, {error} is {texts.short(left)}")
     return {

@@ -11,6 +11,7 @@ from scipy.stats import ttest_1samp, wilcoxon
 
 from keypoint_study import comparisons, ratios
 from keypoint_study.path_errors import ERRORS, path_errors
+from keypoint_study.report import comparison
 from thesis import section_4_2
 
 EIGHT = [f"{number:02d}" for number in range(8)]
@@ -192,7 +193,8 @@ def test_masks_are_compared_with_all_keypoints_and_every_control():
     }
     rows = table[table["metric"] == "rmse"].set_index(["method", "reference", "estimator"])
     assert rows.loc[("masked", "fewer", "refined"), "ratio"] == pytest.approx(2)
-    assert rows.loc[("masked", "mirrored", "thesis"), EIGHT].tolist() == pytest.approx([0.5] * 8)
+    of_sequences = rows.loc[("masked", "mirrored", "thesis"), "ratios"]
+    assert of_sequences == pytest.approx(dict.fromkeys(EIGHT, 0.5))
     deciding = primary(table)
     assert set(deciding["estimator"]) == {"refined"}
     assert list(deciding["metric"]) == list(comparisons.JUDGING_METRICS)
@@ -205,6 +207,14 @@ def test_masks_are_compared_with_all_keypoints_and_every_control():
     words = against.set_index(["reference", "metric"])["verdict"]
     assert set(words["mirrored"]) == {"lower"} and set(words["fewer"]) == {"higher"}
     assert comparisons.verdict_of(table[:0]) == "too few sequences to tell"
+
+
+def test_a_sequence_may_have_the_name_of_a_column():
+    runs = runs_of({"masked": 0.5}).replace({"sequence": {"03": "ratio"}})
+    row = primary(comparisons.comparisons_of(runs)).iloc[0]
+    assert row["n"] == 8 and row["ratios"]["ratio"] == pytest.approx(0.5)
+    table = comparison.long_table_of_ratios(comparisons.comparisons_of(runs)).content
+    assert list(table.columns[-8:]) == sorted(runs["sequence"].unique())
 
 
 def test_sources_are_compared_with_each_other():

@@ -322,14 +322,6 @@ def test_a_study_without_any_masked_run_is_one_clear_line(small_world, small_lab
         study.run(tmp_path / "out")
 
 
-def test_a_sequence_named_like_a_column_of_the_tables_is_refused(tiny_kitti):
-    for place in ("sequences/{}", "poses/{}.txt"):
-        (tiny_kitti / place.format("00")).rename(tiny_kitti / place.format("ratio"))
-    study = Study(tiny_kitti, ("ratio",), (), (5,))
-    with pytest.raises(InputError, match="ratio: has the name of a column"):
-        study.check()
-
-
 def test_a_study_without_true_poses_is_one_line(small_world, masks, tmp_path, capsys):
     folder = tmp_path / "kitti" / "sequences" / "00"
     folder.parent.mkdir(parents=True)

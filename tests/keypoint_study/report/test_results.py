@@ -357,7 +357,7 @@ def test_the_comparison_figure_shows_ratios_and_their_interval():
         & (table["reference"] == "baseline")
     ].iloc[0]
     dots, interval, marker = axes.lines[:3]
-    assert dots.get_xdata() == pytest.approx(row[ELEVEN].astype(float).to_numpy())
+    assert dots.get_xdata() == pytest.approx([row["ratios"][name] for name in ELEVEN])
     assert interval.get_xdata() == pytest.approx([row["low"], row["high"]])
     assert marker.get_xdata() == pytest.approx([row["ratio"]])
     # so that the ends of an interval shorter than the marker are seen
