@@ -15,8 +15,8 @@ import numpy as np
 from keypoint_study import ablations, controls
 from keypoint_study.controls import MadeMasks
 from keypoint_study.sources import Source
-from thesis_repro.data.ids import LABEL_IDS
 from thesis_repro.data.kitti import TRUE_LABELS
+from thesis_repro.data.label_ids import LABEL_IDS
 from thesis_repro.data.sequence import Sequence
 from thesis_repro.masks import MaskSettings
 from thesis_repro.odometry import THESIS, OdometrySettings

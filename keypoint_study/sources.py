@@ -14,7 +14,7 @@ import pandas as pd
 
 from thesis_repro import odometry
 from thesis_repro.data import label_ids
-from thesis_repro.data.ids import LABEL_IDS
+from thesis_repro.data.label_ids import LABEL_IDS
 from thesis_repro.data.sequence import Sequence
 from thesis_repro.data.trajectories import read_truth
 from thesis_repro.errors import InputError, cause

@@ -159,7 +159,6 @@ def test_training_label_maps_of_other_ids_are_told(tiny_cityscapes, capsys, spli
         ("labels", SYNTHIA, {}, "no id above 3, so no sky, vegetation or cars; --ids FILE"),
         ("labels", CAMVID, {}, "no id above 3, so no sky, vegetation or cars; --ids FILE"),
         ("labels", STREET + 11, {}, "KITTI-360"),
-        ("labels", STREET + 3, {"ids": "vistas-1.2"}, "33% parking"),
         ("labels", 0 * STREET + 23, {}, "nothing but sky"),
         ("labels", 0 * STREET, {"ids": "train"}, "nothing but road"),
         ("masks", HALF, {}, None),

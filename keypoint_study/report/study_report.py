@@ -21,6 +21,7 @@ from keypoint_study.report.paths import figure_of_paths
 from keypoint_study.report.style import COLUMN_WIDTH, PAGE_WIDTH, Artefact
 from keypoint_study.sources import KINDS, UNMASKED, FileMasks, Source, own_calls
 from thesis_repro import checks
+from thesis_repro.data.label_ids import LABEL_IDS
 from thesis_repro.data.sequence import Sequence
 from thesis_repro.data.trajectories import write_kitti_poses, write_tum
 from thesis_repro.errors import one_line
@@ -289,7 +290,7 @@ def _changed(source: Source) -> str:
     """
     if not source.has_label_maps:
         return ""
-    default = vars(MaskSettings())
+    default = vars(MaskSettings()) | {"ids": LABEL_IDS}
     settings = vars(source.settings) | {"ids": source.ids}
     changed = [f"; {name} {value}" for name, value in settings.items() if value != default[name]]
     return "".join(changed)

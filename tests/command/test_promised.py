@@ -5,9 +5,7 @@ import json
 from operator import attrgetter
 from pathlib import Path
 
-import numpy as np
 import pandas as pd
-import pytest
 import trials
 
 import opencv_exact
@@ -18,7 +16,6 @@ from keypoint_study.sources import Source
 from thesis_repro.command import cli
 from thesis_repro.command.options import build_parser
 from thesis_repro.odometry import OPENCV
-from thesis_repro.running.files import write_png
 
 RECORD = Path(__file__).with_name("promised.txt")
 RUNS = trials.ROOT / "tests" / "keypoint_study" / "runs.csv"
@@ -101,16 +98,3 @@ def test_what_is_promised_is_what_is_recorded(tiny_kitti, tmp_path, capsys):
     for group, names in now.items():
         gone, new = sorted(record[group] - names), sorted(names - record[group])
         assert not gone + new, f"{group}: gone {gone}, new {new}; {ADVICE}"
-
-
-def test_a_deprecated_name_warns_once_and_does_the_same(tiny_kitti, tmp_path):
-    sequence = tr.Sequence(tiny_kitti, "00")
-    for name in sequence.label_names:
-        fence_and_pole = np.repeat([[4, 5]], 32, axis=1).repeat(48, axis=0)  # train ids
-        write_png(tmp_path / name, fence_and_pole.astype(np.uint8))
-    with pytest.warns(DeprecationWarning, match="give ids to LabelMasks") as told:
-        old = tr.LabelMasks(tmp_path, sequence, 3, tr.MaskSettings(ids="train"))
-    assert [Path(each.filename).name for each in told] == [Path(__file__).name]
-    new, plain = (tr.LabelMasks(tmp_path, sequence, 3, ids=ids) for ids in ("train", "labels"))
-    assert np.array_equal(old[0], new[0]) and not np.array_equal(old[0], plain[0])
-    assert old.record() == new.record() != plain.record()

@@ -7,23 +7,14 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
-from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from thesis_repro import odometry
 from thesis_repro.command.cli import main
-from thesis_repro.data import cameras, kitti, label_ids, trajectories
+from thesis_repro.data import cameras, kitti, trajectories
 from thesis_repro.data.cameras import DISTORTIONS
-from thesis_repro.data.cityscapes import (
-    COLORS,
-    ID,
-    LABELS,
-    TRAINED,
-    read_image,
-    resize_bilinear,
-)
+from thesis_repro.data.cityscapes import read_image, resize_bilinear
 from thesis_repro.data.frames import times_in_names, white_level
-from thesis_repro.data.ids import names
 from thesis_repro.data.sequence import Sequence
 from thesis_repro.data.trajectories import read_poses, read_poses_at, write_tum
 from thesis_repro.errors import InputError
@@ -191,80 +182,6 @@ def test_poses_of_other_data_sets_come_with_what_converts_them(own, name, header
     exec(code, {"np": np, "Rotation": Rotation, "shutil": copies})
     np.testing.assert_allclose(Sequence(None, own).poses, POSES, atol=1e-9)
     assert len(copied) == (4 if name == "KITTI-360" else 0)
-
-
-IDS = np.repeat([[7, 11], [34, 300]], 3, axis=0).astype(np.uint16)
-NAMES = {7: "road", 11: "building", 34: "building", 300: "unlabeled"}
-EXPECTED = np.array([[ID[NAMES[value]] for value in row] for row in IDS.tolist()], np.uint8)
-
-
-def table(folder, rows):
-    path = folder / "ids.csv"
-    path.write_text("id,name\n" + "".join(f"{key}, {name}\n" for key, name in rows))
-    return path
-
-
-def test_ids_of_other_data_sets_are_read_through_a_table(tmp_path):
-    path, ids = tmp_path / "a.png", table(tmp_path, NAMES.items())
-    cv2.imwrite(str(path), IDS)  # 16 bits
-    assert np.array_equal(label_ids.read(path, ids), EXPECTED)
-    small = np.minimum(IDS, 255).astype(np.uint8)
-    palette = Image.fromarray(small, "P")
-    palette.putpalette([number % 251 for number in range(768)])
-    palette.save(path)
-    with pytest.raises(InputError, match=r"a.png: holds 255, which .*ids.csv does not name"):
-        label_ids.read(path, ids)
-    ids = table(tmp_path, [*NAMES.items(), (255, "unlabeled")])
-    assert np.array_equal(label_ids.read(path, ids), EXPECTED)
-    cv2.imwrite(str(path), np.dstack([small] * 3))  # equal channels
-    assert np.array_equal(label_ids.read(path, ids), EXPECTED)
-    cv2.imwrite(str(path), np.array([[*range(19), 255]], np.uint8))
-    named = [LABELS[label].name for label in label_ids.read(path, "train")[0]]
-    assert named == [*TRAINED, "unlabeled"]
-
-
-def test_tables_with_names(tmp_path):
-    path = tmp_path / "a.png"
-    for name in names()[1:]:
-        has_colors, table = label_ids.read_table(name)
-        assert has_colors == (name == "colors") and max(table.values()) < 35
-    assert label_ids.read_table("bdd100k") == label_ids.read_table("train")
-    cv2.imwrite(str(path), np.array([[13, 17, 27, 30, 55, 65]], np.uint8))
-    named = [LABELS[label].name for label in label_ids.read(path, "vistas-1.2")[0]]
-    assert named == ["road", "building", "sky", "vegetation", "car", "unlabeled"]
-    with pytest.raises(InputError) as told:
-        label_ids.read(path, "mapilary")
-    assert all(name in str(told.value) for name in names())
-
-
-@pytest.mark.parametrize("other, advice", [(18, "--ids train"), (26, "255,unlabeled")])
-def test_the_advice_for_255_among_label_ids_is_one_that_reads_it(tmp_path, other, advice):
-    cv2.imwrite(str(tmp_path / "a.png"), np.array([[7, other, 255]], np.uint8))
-    with pytest.raises(InputError, match=f"a.png: label id 255.*{advice}"):
-        label_ids.read(tmp_path / "a.png")
-
-
-def test_colours_are_read_through_a_table(tmp_path):
-    path = tmp_path / "a.png"
-    names = ["road", "car", "sky", "pole", "unlabeled"]
-    labels = np.array([[ID[name] for name in names]], np.uint8)
-    cv2.imwrite(str(path), COLORS[labels][..., ::-1])
-    assert np.array_equal(label_ids.read(path, "colors"), labels)
-    rows = [("#{:02x}{:02x}{:02x}".format(*COLORS[ID[name]]), name) for name in names]
-    assert np.array_equal(label_ids.read(path, table(tmp_path, rows)), labels)
-    with pytest.raises(InputError, match="holds #804080, which"):
-        label_ids.read(path, table(tmp_path, rows[1:]))
-    with pytest.raises(InputError, match="--ids colors"):
-        label_ids.read(path, table(tmp_path, NAMES.items()))
-
-
-@pytest.mark.parametrize(
-    "line", ["8", "8,street", "x,sky", "7,sky", "#464646,sky", "-2,sky", "65536,sky"]
-)
-def test_a_bad_line_of_a_table_is_named(tmp_path, line):
-    (tmp_path / "ids.csv").write_text(f"7,road\n{line}\n")
-    with pytest.raises(InputError, match="ids.csv, line 2: "):
-        label_ids.read_table(tmp_path / "ids.csv")
 
 
 CAMERA = "fx 50\nfy 51\ncx 32\ncy 24\nk1 -0.3\nk2 0.1\np1 0.01\np2 -0.02"

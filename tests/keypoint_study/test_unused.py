@@ -40,7 +40,6 @@ NEW = {
     "thesis_repro/odometry/keypoints.py": "def mine(frame, settings, mask=None):\n    return frame\n"
     "\n\nDETECTORS['mine'] = mine\n",
     "thesis_repro/data/mine.py": "LAYOUT = 'mine'\n\n\ndef is_mine(folder):\n    return False\n",
-    "thesis_repro/data/ids/mine.csv": "1,road\n",
     "thesis_repro/odometry/mine.py": "import cv2\n",
 }
 TABLES = {

@@ -321,7 +321,7 @@ def _image_folders(root: Path, calibration: Path | None = None) -> list[tuple[Pa
 
 
 def _mask_settings(options: Any, has_labels: bool = True) -> Any:
-    from thesis_repro.data.ids import LABEL_IDS
+    from thesis_repro.data.label_ids import LABEL_IDS
     from thesis_repro.masks import MaskSettings
 
     settings = MaskSettings(

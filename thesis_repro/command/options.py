@@ -12,7 +12,6 @@ from typing import Any
 import shtab
 from joblib import cpu_count
 
-from thesis_repro.data import ids
 from thesis_repro.running import values
 
 
@@ -47,6 +46,17 @@ def _keep() -> dict[str, Any]:
     where = ", ".join(kind.help for kind in KINDS.values())
     return dict(
         metavar="|".join(KINDS), default="boundaries", help=f"keypoints {where} (boundaries)"
+    )
+
+
+def _ids() -> dict[str, Any]:
+    from thesis_repro.data.label_ids import LABEL_IDS, NAMES
+
+    return dict(
+        metavar="NAME|FILE",
+        default=LABEL_IDS,
+        help=f"ids or colours that label maps hold: {', '.join(NAMES)}, or a table with lines such as "
+        "34,building or #464646,building (labels)",
     )
 
 
@@ -163,12 +173,7 @@ MASK_OPTIONS: dict[str, Any] = {
         help="no keypoints on people and vehicles, nor within PIXELS of them (0)",
     ),
     "--keep": _keep,
-    "--ids": dict(
-        metavar="NAME|FILE",
-        default=ids.LABEL_IDS,
-        help=f"ids or colours that label maps hold: {', '.join(ids.names())}, or a table with lines such as "
-        "34,building or #464646,building (labels)",
-    ),
+    "--ids": _ids,
     "--margin": dict(
         type=int, default=0, metavar="PIXELS", help="no keypoints near the frame's border (0)"
     ),

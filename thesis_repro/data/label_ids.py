@@ -1,8 +1,8 @@
 """Label maps with other ids or colours than Cityscapes' label ids, read through a table.
 
-A table is a CSV file with a line for each id (34,building) or for each colour (#464646,building).
-The names are those of `cityscapes.LABELS`; what is no class is "unlabeled". The folder ids has a
-file for each table with a name.
+Cityscapes' train ids and colours are known by name. Another table is a CSV file with a line for
+each id (34,building) or for each colour (#464646,building). The names are those of
+`cityscapes.LABELS`; what is no class is "unlabeled".
 """
 
 import csv
@@ -11,13 +11,14 @@ from pathlib import Path
 
 import numpy as np
 
-from thesis_repro.data.cityscapes import ID, read_label_map
-from thesis_repro.data.ids import LABEL_IDS, file, names
+from thesis_repro.data.cityscapes import COLORS, ID, N_CLASSES, TRAINED, read_label_map
 from thesis_repro.data.trajectories import read_text
 from thesis_repro.errors import InputError
 from thesis_repro.running.files import read_color, read_ids
 from thesis_repro.running.provenance import digest_of_file
 
+LABEL_IDS = "labels"  # Cityscapes' own, which need no table
+NAMES = LABEL_IDS, "train", "colors"  # what --ids knows beside files
 NOT_NAMED = 255  # no label id
 LARGEST = {False: 0xFFFF, True: 0xFFFFFF}  # id of 16 bits, and colour
 RGB = np.array([1 << 16, 1 << 8, 1])  # makes one number of a colour
@@ -29,11 +30,17 @@ def read_table(ids: str | Path) -> tuple[bool, dict[int, int]]:
     ids: its name or file. Raises InputError, naming the line, for a line that is not an id or a
     colour and a label.
     """
-    path = file(ids)
+    if ids == "train":
+        train_ids = {number: ID[name] for number, name in enumerate(TRAINED)}
+        return False, train_ids | {255: ID["unlabeled"]}
+    if ids == "colors":
+        colors: dict[int, int] = {}
+        for label, value in enumerate((COLORS[:N_CLASSES] @ RGB).tolist()):
+            colors.setdefault(value, label)  # of labels that share a colour, the first one
+        return True, colors
+    path = Path(ids)
     if not path.exists():
-        raise InputError(
-            f"--ids {ids}: must be {', '.join(names())}, or a file, which is not there"
-        )
+        raise InputError(f"--ids {ids}: must be {', '.join(NAMES)}, or a file, which is not there")
     lines = read_text(path).split("\n")
     table: dict[int, int] = {}
     kinds = set()
@@ -61,10 +68,10 @@ def read_table(ids: str | Path) -> tuple[bool, dict[int, int]]:
 
 
 def record(ids: str | Path) -> dict[str, str]:
-    """Return what the record of results has of a table: its digest."""
+    """Return what the record of results has of a table: its name, or the digest of its file."""
     if ids == LABEL_IDS:
         return {}
-    return {"table": digest_of_file(file(ids))}
+    return {"table": str(ids) if ids in NAMES else digest_of_file(Path(ids))}
 
 
 def read(path: str | Path, ids: str | Path = LABEL_IDS) -> np.ndarray:

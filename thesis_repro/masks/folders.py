@@ -1,7 +1,7 @@
 """Masks of a sequence in files: made from label maps on access, or read from images."""
 
 import os
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ import numpy as np
 from thesis_repro.data import label_ids
 from thesis_repro.data.cameras import Camera
 from thesis_repro.data.frames import say_once
-from thesis_repro.data.ids import LABEL_IDS
+from thesis_repro.data.label_ids import LABEL_IDS
 from thesis_repro.data.sequence import Sequence, check_size
 from thesis_repro.errors import InputError
 from thesis_repro.masks import (
@@ -56,8 +56,7 @@ class LabelMasks:
         self.frame_paths = sequence.frame_paths
         self.size = sequence.size
         self.dilation_width = dilation_width
-        self.settings = replace(settings, ids=LABEL_IDS)
-        self.ids = settings.ids if ids == LABEL_IDS else str(ids)  # the settings': until 2.0
+        self.settings, self.ids = settings, str(ids)
         if settings.has_width:
             check_width(dilation_width, self.size)
 
@@ -104,7 +103,8 @@ def write_masks(masks: LabelMasks, folder: str | Path) -> None:
             folder,
             labels=provenance.digest_of_files(masks.paths),
             size=masks.size,
-            **asdict(masks.settings) | {"ids": masks.ids},
+            **asdict(masks.settings),
+            ids=masks.ids,
             **label_ids.record(masks.ids),
             dilation_width=masks.dilation_width,
             frames=provenance.digest_of_files(masks.frame_paths),

@@ -3,10 +3,8 @@
 MaskSettings chooses among them; its defaults are the thesis's.
 """
 
-import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import cache
+from dataclasses import dataclass
 from numbers import Integral
 from typing import NamedTuple
 
@@ -14,7 +12,6 @@ import cv2
 import numpy as np
 
 from thesis_repro.data.cityscapes import ID, N_CLASSES
-from thesis_repro.data.ids import LABEL_IDS
 from thesis_repro.errors import InputError
 from thesis_repro.masks.filter import CANNY, canny_edges, check_width, dilate, thesis_mask
 from thesis_repro.masks.memory import remembered
@@ -42,7 +39,6 @@ class MaskSettings:
     keypoints are allowed there, except with "static".
     margin: no keypoints within this many pixels of the frame's border. Points there are lost in the
     next frame, and networks that pad with zeros predict false boundaries there.
-    ids: deprecated, an argument of `LabelMasks` instead, as it says what files hold.
     Raises InputError for an unknown name or a bad number of pixels.
     """
 
@@ -52,7 +48,6 @@ class MaskSettings:
     movable: int | None = None
     margin: int = 0
     keep: str = "boundaries"
-    ids: str = LABEL_IDS
     canny: tuple[float, float] = CANNY
 
     @property
@@ -61,9 +56,6 @@ class MaskSettings:
         return KINDS[self.keep].has_width
 
     def __post_init__(self) -> None:
-        if self.ids != LABEL_IDS:
-            text = f"MaskSettings(ids={self.ids!r}) goes in 2.0; give ids to LabelMasks instead"
-            warnings.warn(text, DeprecationWarning, stacklevel=3)  # where settings are made
         for name in ("classes", "canny"):  # they are lists, if read from JSON
             object.__setattr__(self, name, tuple(getattr(self, name)))
         for name, choices in {"boundaries": BOUNDARIES, "keep": KINDS}.items():
@@ -147,7 +139,7 @@ def keypoint_mask(
     label_map = _checked(label_map)
     if settings.has_width:
         check_width(dilation_width, size)
-    if _is_thesis(settings):
+    if settings == THESIS_MASKS:
         assert dilation_width is not None  # checked above
         return thesis_mask(label_map, size, dilation_width)
     mask = KINDS[settings.keep].make(label_map, size, dilation_width, settings)
@@ -158,12 +150,6 @@ def keypoint_mask(
         mask[first] = mask[last] = 0
         mask[:, first] = mask[:, last] = 0
     return mask
-
-
-@cache  # a replaced copy is checked, which takes as long as a small mask
-def _is_thesis(settings: MaskSettings) -> bool:
-    """Whether masks are the thesis's, of any ids."""
-    return replace(settings, ids=LABEL_IDS) == THESIS_MASKS
 
 
 @remembered
