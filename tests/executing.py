@@ -1,23 +1,15 @@
 """Execute every notebook once, on the smallest profile, as they are in git."""
 
 import os
-from pathlib import Path
 
 import nbformat
 from cells import NOTEBOOKS
-from drawn import END
 from nbclient import NotebookClient
 
 from thesis.settings import PREFIX, ROOT
 
 # what a kernel sees of this process's variables: nothing that the Makefile sets
 KEPT = ("PATH", "HOME", "LANG", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
-# executed by every kernel
-STARTUP = """import sys
-sys.path.append({tests!r})
-from drawn import Watch
-Watch(get_ipython(), {folder!r})
-"""
 # that cells show; those that are saved are as usual
 SMALL_PICTURES = """
 get_config().InlineBackend.print_figure_kwargs = {"bbox_inches": None, "dpi": 40}
@@ -44,20 +36,17 @@ def execute(folder, world):
     (run / "checked").touch()  # as if make had checked the data
     (folder / "build/world-smoke").symlink_to(world)
     profile = folder / "ipython/profile_default"
-    (profile / "startup").mkdir(parents=True)
-    watch = STARTUP.format(tests=str(Path(__file__).parent), folder=str(folder))
-    (profile / "startup/watch.py").write_text(watch)
+    profile.mkdir(parents=True)
     (profile / "ipython_kernel_config.py").write_text(SMALL_PICTURES)
     variables = {name: os.environ[name] for name in KEPT if name in os.environ}
     variables |= {"IPYTHONDIR": str(folder / "ipython"), "PYTHONPATH": str(ROOT)} | run_of(folder)
     for name in NOTEBOOKS:
         notebook = nbformat.read(ROOT / "notebooks" / name, 4)
-        notebook.cells.append(nbformat.v4.new_code_cell(END))
         place = {"metadata": {"path": str(ROOT / "notebooks")}}
         client = NotebookClient(
             notebook, kernel_name="python3", shutdown_kernel="immediate", resources=place
         )
-        client.execute(env=variables | {"WATCHED": name[:2]})
+        client.execute(env=variables)
         nbformat.write(notebook, run / "notebooks" / name)
         if name == NOTEBOOKS[0]:
             (run / "drives").touch()  # as if make had rendered the drives

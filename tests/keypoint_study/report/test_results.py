@@ -8,12 +8,10 @@ from types import SimpleNamespace
 
 import made_up
 import matplotlib
-import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 import pytest
 from cells import cells
-from drawn import problems
 from matplotlib.container import BarContainer
 from matplotlib.font_manager import FontProperties
 from matplotlib.textpath import TextPath
@@ -336,10 +334,9 @@ def test_figures_of_equal_and_of_noisy_errors_can_be_drawn(names, noise, sources
     runs = runs_of(names, lambda *_: 0.1, noise=noise, sources=sources)
     table = comparisons.comparisons_of(runs)
     if sources == ("",):
-        assert problems(chapter4.figure_against_width(*widths_of(runs), "rmse")) == []
+        chapter4.figure_against_width(*widths_of(runs), "rmse").draw_without_rendering()
         figures = drawn_by_cells(runs)
         assert set(figures) == {f"figure_4_{number:02d}" for number in (7, 13, 14, 15, 16)}
-        assert [name for name, figure in figures.items() if problems(figure)] == []
     figure = comparison.figure_of_ratios(table).content
     figure.draw_without_rendering()
     assert all(edge > 0 for axes in figure.axes for edge in axes.get_xlim())
@@ -373,7 +370,7 @@ def test_the_curve_of_few_keypoints_shows_every_ratio():
         for error in comparisons.JUDGING_METRICS
     ]
     figure = few_keypoints.figure_of_few(pd.DataFrame(rows))
-    assert problems(figure) == [] and len(figure.axes) == 4
+    assert len(figure.axes) == 4
     for panel in figure.axes:
         low, high = panel.get_ylim()
         assert low < 0.3 and high > 90
@@ -383,37 +380,15 @@ def test_the_curve_of_few_keypoints_shows_every_ratio():
     assert [panel.get_ylim() for panel in enlarged] == [few_keypoints.NEAR] * 4
 
 
-def test_the_figure_of_paths_shows_repetitions_and_their_errors():
+def test_the_figure_of_paths_shows_the_errors_of_all_repetitions():
     runs = comparisons.of_method(runs_of(["00", "05"], lambda *_: 1.0), "baseline")
     paths = {
         (row.sequence, row.run): AHEAD + [[0, 0, 0], [0, 0, 0], [row.repetition, 0, 0], [3, 4, 0]]
         for row in runs.itertuples()
     }
     figure = chapter4.figure_paths({"00": AHEAD, "05": AHEAD}, runs[::-1], paths)
-    true, *lines = figure.axes[0].lines
-    assert len(lines) == 3 and len(figure.axes) == 4
-    assert all(lines[0].get_linewidth() > line.get_linewidth() for line in lines[1:])
     distances = [line.get_ydata().tolist() for line in figure.axes[2].lines]
     assert distances == [[0, 0, 0, 5], [0, 0, 1, 5], [0, 0, 2, 5]]
-
-
-@pytest.mark.parametrize("failed", [0, 1])
-def test_a_failed_run_is_marked_where_runs_are_drawn(failed):
-    runs = runs_of(["00", "05"], lambda *_: 1.0, noise=0.1)
-    rows = (runs["method"] == "baseline") & (runs["sequence"] == "05")
-    masked_rows = (runs["method"] == "masked") & (runs["sequence"] == "05")
-    runs.loc[(rows | masked_rows) & (runs["repetition"] == 1), "failed"] = 50.0 * failed
-    of_all = comparisons.of_method(runs, "baseline")
-    paths = {(row.sequence, row.run): AHEAD for row in of_all.itertuples()}
-    truths = {"00": AHEAD, "05": AHEAD}
-    for figure in (
-        chapter4.figure_paths(truths, of_all, paths),
-        chapter4.figure_against_width(*widths_of(runs), "rmse"),
-        *(figure for name, figure in drawn_by_cells(runs).items() if name != "figure_4_07"),
-    ):
-        crosses = [line for line in figure.findobj(plt.Line2D) if line.get_marker() == "x"]
-        words = [text.get_text() for text in figure.findobj(plt.Text)]
-        assert bool(crosses) == bool(failed) and words.count("failed run") == failed
 
 
 def test_bars_show_the_mean_of_each_method_and_its_repetitions():
@@ -425,17 +400,6 @@ def test_bars_show_the_mean_of_each_method_and_its_repetitions():
     whiskers = bars.errorbar.lines[2][0].get_segments()
     ends = [segment[:, 1].tolist() for segment in whiskers]
     assert np.array(ends) == pytest.approx(spread[["lowest", "highest"]].to_numpy())
-
-
-def test_a_sequence_far_above_the_others_breaks_the_axis_of_bars():
-    runs = runs_of(["00", "05", "drive0005"], lambda *_: 1.0)
-    runs.loc[runs["sequence"] == "05", "rmse"] *= 50
-    runs = runs[runs["estimator"] == "thesis"]
-    above, below = chapter4.figure_of_bars(runs, "rmse").axes
-    top, others = runs["rmse"].max(), runs.loc[runs["sequence"] != "05", "rmse"].max()
-    assert others < below.get_ylim()[1] < 1.2 * others
-    assert above.get_ylim()[0] == below.get_ylim()[1] and above.get_ylim()[1] > top
-    assert len(chapter4.figure_of_bars(runs[runs["sequence"] != "05"], "rmse").axes) == 1
 
 
 HOSTILE = [
