@@ -12,7 +12,7 @@ def as_points(name: str, points: Any, kind: type = np.float64) -> np.ndarray:
     Raises ValueError for other shapes, which could only be read as other points.
     """
     refuse_umat(name, points)
-    array = np.asarray(points, kind)
+    array: np.ndarray = np.asarray(points, kind)
     is_list = array.ndim == 2 or (array.ndim == 3 and 1 in array.shape[:2])
     if not is_list or array.shape[-1] != 2:
         raise ValueError(f"{name}: of shape {array.shape}; must be (N, 2) or (N, 1, 2)")
