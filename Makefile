@@ -8,7 +8,7 @@ BIN := .venv/bin
 # one of the command line; of the environment, only these are taken.
 SETTINGS := KITTI CITYSCAPES KITTI_SEMANTIC PROFILE IMAGE_SIZE BASE_FILTERS BATCH_SIZE EPOCHS FRAMES WIDTHS REPETITIONS JOBS \
             BUILD FIGURES DASK_SCHEDULER
-MINE := PYTHON GPU CAMVID JOB TRAINED PSEUDO RAW LISTEN RUN LAST
+MINE := PYTHON GPU CAMVID PSEUDO RAW LISTEN RUN LAST
 of = $(foreach name,$(2),$(if $(filter $(1),$(origin $(name))),$(name)))
 given := $(filter-out $(MINE) MAKE% -%,$(sort $(call of,command line,$(.VARIABLES))))
 around := $(foreach name,$(call of,environment,$(SETTINGS)),$(if $(THESIS_REPRO_$(name)),,$(name)))
@@ -29,7 +29,7 @@ export OMP_NUM_THREADS := $(firstword $(subst $(comma), ,$(OMP_NUM_THREADS)))
 endif
 unexport PYTHONHOME PYTHONDONTWRITEBYTECODE PYTHONSTARTUP JUPYTER_PATH CDPATH TF_USE_LEGACY_KERAS XLA_FLAGS TF_XLA_FLAGS
 
-.PHONY: help setup figures book notebooks page excerpts evidence timings pictures camvid test torture lint lab bench weights pins clean check-data
+.PHONY: help setup figures book notebooks page excerpts evidence timings pictures test torture lint lab bench weights pins clean check-data
 help:
 	@echo "make figures     write every table and figure to figures/, from embedded data, or from KITTI=/path CITYSCAPES=/path"
 	@echo "                 (KITTI_SEMANTIC=/path: also test the label maps); size: PROFILE=smoke|lab|demo|thesis, or single:"
@@ -44,7 +44,6 @@ help:
 	@echo "                 frames, elsewhere (whole sequences take hours; FRAMES=00:0-129,04:0-37 takes parts of sequences)"
 	@echo "make timings     after make figures, or make evidence KITTI=build/excerpts: measure the times that their figures show"
 	@echo "make bench       measure the relative cost of odometry and network (KITTI=/path), into build/bench.json"
-	@echo "make camvid      train the thesis's network at its size on CAMVID=/path, into figures/camvid (many hours; EPOCHS=10)"
 	@echo "make pictures    draw the pictures of real streets from KITTI=build/excerpts"
 	@echo "make weights     train the shipped model anew into build/shipped, CAMVID=/path KITTI_SEMANTIC=/path PSEUDO=/path"
 	@echo "make book        after make figures: write all of its book, with the reference, into build/; a warning is an error"
@@ -153,8 +152,6 @@ timings: setup
 	@$(if $(KITTI),THESIS_REPRO_PROFILE=thesis) $(BIN)/python tools/timings.py
 pictures: setup
 	@$(BIN)/python tools/pictures.py
-camvid: setup
-	@THESIS_REPRO_PROFILE=$(or $(THESIS_REPRO_PROFILE),thesis) $(BIN)/python tools/camvid.py "$(CAMVID)" "$(JOB)" "$(TRAINED)"
 weights: setup
 	@$(BIN)/python tools/train_shipped.py "$(CAMVID)" "$(KITTI_SEMANTIC)" "$(PSEUDO)" build/shipped
 # Not `setup`, which would install what is not resolved yet.

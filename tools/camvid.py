@@ -1,146 +1,167 @@
-"""Train the thesis's network at its size on CamVid, and write its curves and scores.
+"""Train the thesis's network at its size on CamVid, and write its curves, scores and tables.
 
-`make camvid CAMVID=/path` takes the thesis's settings: 64 filters, 320x320, its loss, weights and
-augmentation, Adam, batches of 16, at most 100 epochs, a patience of 5. It takes hours, and can be
-stopped and resumed at any moment. EPOCHS=10 ends sooner; a later call with more goes on.
-KITTI_SEMANTIC=/path: also the mean IoU on KITTI's street scenes. KITTI=/path: also its label maps,
-and what masks from them do to the odometry.
-JOB=folder only writes what tools/camvid_jax.py needs to train elsewhere, on a GPU; TRAINED=folder
-takes what that program wrote, one training a seed, in place of a training here.
-Cityscapes, which the thesis trained on, cannot be had here. CamVid has images to validate on, so
-none are split off.
+64 filters, 320x320 pixels, the thesis's loss, weights and augmentation, Adam, batches of 16, at
+most 100 epochs, a patience of 5: many hours on a CPU, minutes on a GPU. A stopped training goes on
+after its last epoch. Any backend of Keras trains: --backend jax, where there is no TensorFlow.
+Scores and tables need TensorFlow: there, the command without this option takes the folder of what
+was trained elsewhere. Cityscapes, which the thesis trained on, cannot be had here. CamVid has
+images to validate on, so none are split off.
 """
 
-import json
-import sys
+import argparse
+import os
 import time
 from pathlib import Path
 
-from thesis_repro import segmentation  # noqa: F401  sets what TensorFlow reads at its import
-
-# isort: split
-import cv2
-import keras
 import numpy as np
 import pandas as pd
-import tensorflow as tf
 
 from keypoint_study import comparisons
 from keypoint_study.jobs import CONTROL_WIDTH
 from keypoint_study.plan import Study
 from keypoint_study.report import comparison, style
 from keypoint_study.sources import Source
-from thesis import domain_gap, timing
+from thesis import domain_gap
 from thesis.reported import REPORTED
-from thesis.settings import PROFILES, ROOT, folder, read_settings
+from thesis.settings import PROFILES, ROOT
 from thesis_repro.data import cityscapes, kitti
 from thesis_repro.data.sequence import Sequence
-from thesis_repro.errors import InputError
 from thesis_repro.running import files, program, provenance
-from thesis_repro.segmentation import augmentation, prediction, training
-from thesis_repro.segmentation.unet import build_unet
+from thesis_repro.segmentation import augmentation, quietly
 
-BEST = "best.keras"
+SIZES = PROFILES["thesis"]
+SMOOTH = 1e-5  # of segmentation-models: an absent class scores 1
+EPSILON = 1e-7  # of Keras, where the library clips probabilities
+HISTORY, STATE, BEST = "history.csv", "state.npz", "best.npz"  # files of a training
 EXAMPLE = 0  # validation image whose label maps are drawn; the image itself is not ours to show
 SCORES = {"loss": "loss", "f1-score": "F1 score", "iou_score": "IoU score"}
 REPORTED_KEYS = {"loss": "loss", "f1-score": "f1", "iou_score": "iou"}
 
 
-class Timed(keras.callbacks.Callback):
-    """Adds the seconds of an epoch to its row of the history."""
-
-    def on_epoch_begin(self, epoch, logs=None):
-        """Start the clock."""
-        self._began = time.monotonic()
-
-    def on_epoch_end(self, epoch, logs=None):
-        """Add the seconds, before the row is written."""
-        logs["seconds"] = time.monotonic() - self._began
+# The training
 
 
-def doubled(images, labels, transforms, seed):
+def doubled(pairs, transforms, seed):
     """Return images and label maps, each with a transformed copy after all of them (A.3)."""
+    images, labels = cityscapes.load(pairs, SIZES.image_size)
     copies = augmentation.augment_set(images, labels, transforms, seed)
-    return tuple(np.concatenate(pair) for pair in zip((images, labels), copies, strict=True))
+    return np.concatenate([images, copies[0]]), np.concatenate([labels, copies[1]])
 
 
-def batches_of(camvid, sizes, seed):
-    """Return the batches of the training and of the validation, as notebooks 1 and 2 make them."""
-    sets = []
-    for split in ("train", "val"):
-        pairs = cityscapes.pairs(camvid, split, limit=sizes.training_images)
-        sets.append(cityscapes.load(pairs, sizes.image_size))
-    full = augmentation.training_augmenter(sizes.image_size)
-    train = doubled(*sets[0], full, seed)
-    validation = doubled(*sets[1], augmentation.validation_augmenter(), seed + 1)
-    return (
-        training.Batches([train], sizes.batch_size, seed),
-        training.Batches([validation], sizes.batch_size),
-        sets[1],
-    )
+def batches_of(images, labels, seed=None, epoch=0):
+    """Yield the batches of an epoch, in the order of `training.Batches`."""
+    order = np.arange(len(images))
+    if seed is not None:
+        order = np.random.default_rng((seed, epoch)).permutation(order)
+    for start in range(0, len(order), SIZES.batch_size):
+        chosen = order[start : start + SIZES.batch_size]
+        yield images[chosen].astype(np.float32), labels[chosen]
 
 
-def train(train_batches, validation, sizes, root, seed):
-    """Train, or go on training, and return the folder of the training and its history."""
-    for set_threads in ("set_intra_op_parallelism_threads", "set_inter_op_parallelism_threads"):
-        getattr(tf.config.threading, set_threads)(sizes.threads)  # decide how sums are rounded
+def loss_and_scores():
+    """Return the loss, IoU and F1 score of label maps and probabilities, in Keras' operations.
+
+    They are those of segmentation-models, which needs TensorFlow.
+    """
+    from keras import ops
+
+    weights = np.asarray(cityscapes.CLASS_WEIGHTS, np.float32)
+
+    def one_hot(labels):
+        return ops.one_hot(ops.cast(labels, "int32"), cityscapes.N_CLASSES, dtype="float32")
+
+    def dice(true, predicted):
+        overlap = ops.sum(true * predicted, axis=(0, 1, 2))
+        sizes = ops.sum(true + predicted, axis=(0, 1, 2))
+        return (2 * overlap + SMOOTH) / (sizes + SMOOTH)
+
+    def loss(labels, predicted):
+        true = one_hot(labels)
+        clipped = ops.clip(predicted, EPSILON, 1 - EPSILON)
+        focal = -true * 0.25 * (1 - clipped) ** 2 * ops.log(clipped)
+        return 1 - ops.mean(dice(true, predicted) * weights) + ops.mean(focal)
+
+    def iou_score(labels, predicted):
+        true, chosen = one_hot(labels), ops.cast(predicted > 0.5, "float32")
+        overlap = ops.sum(true * chosen, axis=(0, 1, 2))
+        union = ops.sum(true + chosen, axis=(0, 1, 2)) - overlap
+        return ops.mean((overlap + SMOOTH) / (union + SMOOTH))
+
+    def f1_score(labels, predicted):
+        return ops.mean(dice(one_hot(labels), ops.cast(predicted > 0.5, "float32")))
+
+    return loss, iou_score, f1_score
+
+
+def build():
+    """Return the thesis's network at its size, with fresh weights."""
+    from thesis_repro.segmentation.unet import build_unet
+
+    size = SIZES.image_size
+    return build_unet((size, size, 1), cityscapes.N_CLASSES, SIZES.base_filters)
+
+
+def write_arrays(path, arrays):
+    """Write arrays as a NumPy archive, by their places."""
+    with files.atomic(path) as temporary, open(temporary, "wb") as file:
+        np.savez(file, *arrays)
+
+
+def read_arrays(path):
+    """Return the arrays of a file of `write_arrays`."""
+    with np.load(path) as archive:
+        return [archive[name] for name in archive.files]
+
+
+def is_done(rows, epochs):
+    """Say whether a training has all epochs, or had none with a lower validation loss for long."""
+    losses = [row["val_loss"] for row in rows]
+    waited = len(rows) - int(np.argmin(losses)) - 1 if rows else 0
+    return len(rows) >= epochs or waited >= SIZES.patience
+
+
+def train(folder, train_set, validation_set, seed, epochs):
+    """Train a network, or go on training, until it is done; its files lie in a folder."""
+    rows = pd.read_csv(folder / HISTORY).to_dict("records") if (folder / HISTORY).exists() else []
+    if is_done(rows, epochs):
+        return
+    with quietly():
+        import keras
+
     keras.utils.set_random_seed(seed)
-    size = sizes.image_size
-    model = build_unet((size, size, 1), cityscapes.N_CLASSES, sizes.base_filters)
-    optimizer = keras.optimizers.Adam(sizes.learning_rate)
-    optimizer.build(model.trainable_variables)
-    loss = training.fused_loss(training.total_loss())
-    model.compile(optimizer, loss, metrics=training.metrics())
-    stage = provenance.stage(root, **training.made_from(model, train_batches, validation))
-    early = keras.callbacks.EarlyStopping(monitor="val_loss", patience=sizes.patience)
-    kept = keras.callbacks.ModelCheckpoint(stage / BEST, monitor="val_loss", save_best_only=True)
-    resumable = training.ResumableTraining(stage, train_batches, [early, kept])
-    model.fit(
-        train_batches.dataset(),
-        validation_data=validation.dataset(),
-        epochs=sizes.epochs,
-        shuffle=False,
-        verbose=0,
-        callbacks=[early, kept, Timed(), resumable],
-    )
-    return stage, resumable.history
+    model = build()
+    loss, *scores = loss_and_scores()
+    model.compile(keras.optimizers.Adam(SIZES.learning_rate), loss, metrics=scores)
+    model.optimizer.build(model.trainable_variables)
+    variables = model.variables + model.optimizer.variables
+    if (folder / STATE).exists():
+        for variable, value in zip(variables, read_arrays(folder / STATE), strict=True):
+            variable.assign(value)
+    steps = -(-len(train_set[0]) // SIZES.batch_size)
+    rows = rows[: int(model.optimizer.iterations) // steps]  # it may have been stopped in between
+    device = keras.distribution.list_devices()[0]
+    made_on = f"Keras {keras.__version__} on {keras.backend.backend()}, {device}"
+    files.write_text(folder / "machine.txt", made_on)
+    while not is_done(rows, epochs):
+        began, epoch = time.monotonic(), len(rows)
+        batches = batches_of(*train_set, seed, epoch)
+        for batch in files.progress(batches, f"epoch {epoch + 1}", steps, unit="batch"):
+            trained = model.train_on_batch(*batch, return_dict=True)
+        model.reset_metrics()
+        for batch in batches_of(*validation_set):
+            validated = model.test_on_batch(*batch, return_dict=True)
+        model.reset_metrics()
+        logs = trained | {f"val_{name}": value for name, value in validated.items()}
+        logs = {name.replace("f1_score", "f1-score"): float(logs[name]) for name in sorted(logs)}
+        rows.append({"epoch": epoch + 1, **logs, "seconds": time.monotonic() - began})
+        if logs["val_loss"] == min(row["val_loss"] for row in rows):
+            write_arrays(folder / BEST, model.get_weights())
+        files.write_text(folder / HISTORY, pd.DataFrame(rows).to_csv(index=False))
+        write_arrays(folder / STATE, [variable.numpy() for variable in variables])
+        print(f"seed {seed}, epoch {epoch + 1}: validation loss {logs['val_loss']:.4f}", flush=True)
 
 
-def write_job(folder, train_batches, validation, sizes, seed):
-    """Write what tools/camvid_jax.py reads: the network, its settings, the images, augmented."""
-    size = sizes.image_size
-    network = build_unet((size, size, 1), cityscapes.N_CLASSES, sizes.base_filters)
-    for split, batches in (("train", train_batches), ("val", validation)):
-        for kind, images in zip(("images", "labels"), batches.sets[0], strict=True):
-            (folder / f"{split}_{kind}").mkdir(parents=True)
-            for index, image in enumerate(files.progress(images, f"{split} {kind}", unit="image")):
-                path = folder / f"{split}_{kind}" / f"{index:04}.webp"
-                # the quality of no loss
-                cv2.imwrite(f"{path}", image, [cv2.IMWRITE_WEBP_QUALITY, 101])
-    job = {
-        "network": json.loads(network.to_json()),
-        "class_weights": np.asarray(cityscapes.CLASS_WEIGHTS).tolist(),
-        "seed": seed,
-    }
-    numbers = ("batch_size", "learning_rate", "epochs", "patience")
-    job |= {name: getattr(sizes, name) for name in numbers}
-    files.write_text(folder / "job.json", json.dumps(job))
-
-
-def read_trained(folder, sizes):
-    """Return {seed: (network, history)} of what tools/camvid_jax.py wrote, and where it ran."""
-    size = sizes.image_size
-    trained = {}
-    for path in sorted(folder.glob("seed_*.json")):
-        network = build_unet((size, size, 1), cityscapes.N_CLASSES, sizes.base_filters)
-        with np.load(path.with_suffix(".npz")) as weights:
-            network.set_weights([weights[name].astype(np.float32) for name in weights.files])
-        history = pd.DataFrame(json.loads(path.read_text(encoding="utf-8")))
-        history.columns = history.columns.str.replace("f1_score", "f1-score")  # the library's name
-        trained[int(path.stem.removeprefix("seed_"))] = network, history
-    if not trained:
-        raise InputError(f"{folder}: TRAINED has no seed_0.json; tools/camvid_jax.py writes it")
-    return trained, (folder / "machine.txt").read_text(encoding="utf-8").strip()
+# Figures and tables
 
 
 def curves(history):
@@ -156,25 +177,27 @@ def curves(history):
     return figure
 
 
-def example(model, images, labels):
+def example(model, pairs):
     """Draw the label map of an image by people, and the network's (Figure 4.3)."""
-    predicted = prediction.predict(model, images[EXAMPLE : EXAMPLE + 1])[0]
+    from thesis_repro.segmentation import prediction
+
+    images, labels = cityscapes.load(pairs[EXAMPLE : EXAMPLE + 1], SIZES.image_size)
+    predicted = prediction.predict(model, images)[0]
     figure, panels = style.new_figure(1, 2, height=3.4)
-    maps = {"label map by people": labels[EXAMPLE], "label map by the network": predicted}
+    maps = {"label map by people": labels[0], "label map by the network": predicted}
     for panel, (title, label_map) in zip(panels, maps.items(), strict=True):
         style.show_image(panel, cityscapes.colorize(label_map), title)
-    known = labels[EXAMPLE][labels[EXAMPLE] < cityscapes.N_CLASSES]
-    style.class_legend(figure, known, predicted)
+    style.class_legend(figure, labels[0][labels[0] < cityscapes.N_CLASSES], predicted)
     return figure
 
 
-def facts_of_training(history, patience):
+def facts_of_training(history):
     """Return {fact: text} of a training: its epochs, and the scores of its last and best epoch."""
     best, last = history.loc[history["val_loss"].idxmin()], history.iloc[-1]
-    stopped = last["epoch"] - best["epoch"] >= patience
+    stopped = last["epoch"] - best["epoch"] >= SIZES.patience
     facts = {
         "epochs": f"{len(history)}",
-        "ended by early stopping": "yes" if stopped else "no: EPOCHS ended it",
+        "ended by early stopping": "yes" if stopped else "no: --epochs ended it",
         "epoch of the lowest validation loss": f"{best['epoch']:.0f}",
         "seconds an epoch, median": f"{history['seconds'].median():.1f}",
     }
@@ -185,91 +208,99 @@ def facts_of_training(history, patience):
     return facts
 
 
-def table_of_training(histories, patience):
+def table_of_training(histories):
     """Return one row a fact, one column a training, and what the thesis reports of Cityscapes."""
-    facts = {
-        f"CamVid, seed {seed}": facts_of_training(history, patience)
-        for seed, history in histories.items()
-    }
-    reported = REPORTED["segmentation_results"]
-    thesis = {"epochs": "24", "ended by early stopping": "yes"} | {
-        f"{title}, {part}, last epoch (best epoch)": str(reported[key][REPORTED_KEYS[name]])
-        for part, key in (("training", "train"), ("validation", "validation"))
-        for name, title in SCORES.items()
-    }
+    facts = {f"CamVid, seed {seed}": facts_of_training(rows) for seed, rows in histories.items()}
+    thesis = {"epochs": "24", "ended by early stopping": "yes"}
+    for part, key in (("training", "train"), ("validation", "validation")):
+        for name, title in SCORES.items():
+            value = REPORTED["segmentation_results"][key][REPORTED_KEYS[name]]
+            thesis[f"{title}, {part}, last epoch (best epoch)"] = str(value)
     table = pd.DataFrame(facts | {"Cityscapes, thesis": thesis}).fillna("")
     return table.loc[list(next(iter(facts.values())))].rename_axis("training").reset_index()
 
 
-def streets(settings, labels, out, note):
-    """Compare masks from the label maps with all keypoints, and write the table."""
-    names = tuple(kitti.sequences(settings.kitti))
+def table_of_streets(model, root, folder):
+    """Return the errors with masks from a network's label maps, over those with all keypoints."""
+    from thesis_repro.segmentation import prediction
+
+    names, labels = kitti.sequences(root), folder / "labels"
+    for name in names:
+        prediction.write_label_maps(model, Sequence(root, name).frame_paths, labels / name)
     study = Study(
-        settings.kitti,
-        names,
+        root,
+        tuple(names),
         (Source(labels),),
         (CONTROL_WIDTH,),
         estimators=("refined", "thesis"),
-        repetitions=settings.sizes.repetitions,
+        repetitions=SIZES.repetitions,
     )
-    folder = settings.build.parent / "camvid" / "study"
-    table = comparisons.comparisons_of(study.run(folder, settings.jobs).table)
-    over_all = table[(table["reference"] == "baseline") & (table["method"] == "masked")]
-    style.save_table(comparison.table_of_ratios(comparison.all_of(over_all)), out, "streets", note)
+    table = comparisons.comparisons_of(study.run(folder / "study").table)
+    of_masks = table[(table["reference"] == "baseline") & (table["method"] == "masked")]
+    return comparison.table_of_ratios(comparison.all_of(of_masks))
 
 
-def main(camvid, job="", trained=""):
-    """Train, or read trainings, and write what they give."""
-    if not camvid:
-        raise InputError("CAMVID: give the folder that holds train, trainannot, val and valannot")
-    settings = read_settings()
-    sizes = settings.sizes
-    thesis_sizes = PROFILES["thesis"]
-    named = [f"{sizes.image_size}", f"{sizes.base_filters}", f"{sizes.training_images or 'all'}"]
-    root = settings.build.parent / "camvid" / "-".join(named)
-    is_thesis = settings.profile == "thesis" and all(
-        getattr(sizes, name) == getattr(thesis_sizes, name)
-        for name in ("image_size", "base_filters", "batch_size", "training_images")
-    )
-    out = ROOT / "figures" / "camvid" if is_thesis else root / "figures"
-    train_batches, validation, held_out = batches_of(folder(camvid), sizes, settings.seed)
-    if job:
-        write_job(Path(job), train_batches, validation, sizes, settings.seed)
-        program.summary(f"{job}: written; tools/camvid_jax.py trains it")
-        return
-    if trained:
-        networks, machine = read_trained(Path(trained), sizes)
-    else:
-        stage, history = train(train_batches, validation, sizes, root / "training", settings.seed)
-        networks = {settings.seed: (training.load_model(stage / BEST), history)}
-        machine = timing.processor()
-    histories = {seed: history for seed, (_, history) in networks.items()}
-    model, history = next(iter(networks.values()))
-    size = f"{sizes.base_filters} filters, {sizes.image_size}x{sizes.image_size} pixels"
+@style.applied()
+def write(options, folders, held_out):
+    """Write the figures and tables of all trainings. folders: of the trainings, by seed."""
+    histories = {seed: pd.read_csv(folder / HISTORY) for seed, folder in folders.items()}
+    networks = {seed: build() for seed in folders}
+    for seed, network in networks.items():
+        network.set_weights(read_arrays(folders[seed] / BEST))
+    out, first = options.figures, options.seeds[0]
+    size = f"{SIZES.base_filters} filters, {SIZES.image_size}x{SIZES.image_size} pixels"
+    machine = (folders[first] / "machine.txt").read_text(encoding="utf-8")
     note = f"the thesis's network, {size}, trained on CamVid; {machine}"
-    style.save_figure(curves(history), out, "figure_4_01", note)
+    style.save_figure(curves(histories[first]), out, "figure_4_01", note)
     rows = pd.concat([rows.assign(seed=seed) for seed, rows in histories.items()])
     provenance.write_table(out / "figure_4_01.csv", rows)
-    style.save_figure(example(model, *held_out), out, "figure_4_03", f"{note}; CamVid, validation")
-    absent = (
-        f"{note}; F1 and IoU: means over {cityscapes.N_CLASSES} outputs, absent classes score 1"
-    )
-    style.save_table(table_of_training(histories, sizes.patience), out, "training", absent)
-    domains = {"CamVid, validation": cityscapes.pairs(folder(camvid), "val")}
-    if settings.kitti_semantic:
-        domains["KITTI's street scenes"] = cityscapes.pairs(settings.kitti_semantic, "train")
-    by_seed = {f"seed {seed}": model for seed, (model, _) in networks.items()}
+    drawn = example(networks[first], held_out)
+    style.save_figure(drawn, out, "figure_4_03", f"{note}; CamVid, validation")
+    absent = f"F1 and IoU: means over {cityscapes.N_CLASSES} outputs, absent classes score 1"
+    style.save_table(table_of_training(histories), out, "training", f"{note}; {absent}")
+    domains = {"CamVid, validation": held_out}
+    if options.kitti_semantic:
+        domains["KITTI's street scenes"] = cityscapes.pairs(options.kitti_semantic, "train")
+    by_seed = {f"seed {seed}": network for seed, network in networks.items()}
     scores = domain_gap.scores_of_models(by_seed, domains)
     style.save_table(domain_gap.table_of_scores(scores), out, "scores", note)
-    if not settings.kitti_is_embedded:
-        name = next(iter(by_seed))  # label maps take minutes, so only the first network makes them
-        labels = root / "labels" / f"CamVid, {name}"
-        for street in kitti.sequences(settings.kitti):
-            paths = Sequence(settings.kitti, street).frame_paths
-            prediction.write_label_maps(model, paths, labels / street)
-        streets(settings, labels, out, note)
-    program.summary(f"curves, scores and an example: {out}")
+    if options.kitti:  # label maps take minutes, so only the first network makes them
+        table = table_of_streets(networks[first], options.kitti, folders[first])
+        style.save_table(table, out, "streets", note)
+
+
+def main(arguments=None):
+    """Train, and write what the trainings give."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("camvid", type=Path, help="folder with train, trainannot, val and valannot")
+    parser.add_argument("--folder", type=Path, default=ROOT / "build/camvid", help="of trainings")
+    parser.add_argument("--figures", type=Path, default=ROOT / "figures/camvid")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="one training each")
+    parser.add_argument("--epochs", type=int, default=SIZES.epochs)
+    parser.add_argument("--backend", default="tensorflow", help="of Keras: jax, torch")
+    parser.add_argument("--kitti", type=Path, help="also write what its masks do to the odometry")
+    parser.add_argument("--kitti-semantic", type=Path, help="also score KITTI's street scenes")
+    options = parser.parse_args(arguments)
+    os.environ["KERAS_BACKEND"] = options.backend  # the package sets TensorFlow; Keras reads it
+    pairs = {split: cityscapes.pairs(options.camvid, split) for split in ("train", "val")}
+    made_from = provenance.digest_of_files(
+        path for split in pairs.values() for pair in split for path in pair[1:]
+    )
+    transforms = augmentation.training_augmenter(SIZES.image_size)
+    train_set = doubled(pairs["train"], transforms, 0)
+    validation_set = doubled(pairs["val"], augmentation.validation_augmenter(), 1)
+    folders = {}
+    for seed in options.seeds:
+        folders[seed] = provenance.stage(
+            options.folder / f"seed_{seed}", images=made_from, sizes=SIZES, seed=seed
+        )
+        train(folders[seed], train_set, validation_set, seed, options.epochs)
+    if options.backend != "tensorflow":
+        program.summary(f"{options.folder}: trained; without --backend, tables are written")
+        return
+    write(options, folders, pairs["val"])
+    program.summary(f"curves, scores and an example: {options.figures}")
 
 
 if __name__ == "__main__":
-    program.run_main(lambda: main(*sys.argv[1:]))
+    program.run_main(main)

@@ -1,7 +1,4 @@
-"""The training of the thesis's network, at tiny size, here and by the program for elsewhere."""
-
-import json
-import time
+"""The training of the thesis's network, at tiny size: its loss, its order, stops, tables."""
 
 import numpy as np
 import pandas as pd
@@ -9,45 +6,22 @@ import pytest
 import tensorflow as tf
 
 import camvid
-import camvid_jax
-from thesis.settings import read_settings
-from thesis_repro.data.cityscapes import CLASS_WEIGHTS, N_CLASSES
+from thesis.settings import PROFILES
+from thesis_repro.data.cityscapes import N_CLASSES
+from thesis_repro.errors import InputError
 from thesis_repro.segmentation import augmentation, training
 
 pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(autouse=True)
-def tiny(tiny_cityscapes, tmp_path, monkeypatch):
-    monkeypatch.setenv("THESIS_REPRO_PROFILE", "smoke")
-    monkeypatch.setenv("THESIS_REPRO_BUILD", str(tmp_path))
-    monkeypatch.setenv("THESIS_REPRO_KITTI_SEMANTIC", str(tiny_cityscapes))
-    monkeypatch.setattr(camvid.tf.config.threading, "set_intra_op_parallelism_threads", int)
-    monkeypatch.setattr(camvid.tf.config.threading, "set_inter_op_parallelism_threads", int)
+def tiny(monkeypatch):
+    monkeypatch.setattr(camvid, "SIZES", PROFILES["smoke"])
 
 
-@pytest.mark.torture
-def test_a_longer_training_goes_on_and_writes_curves_and_scores(
-    tiny_cityscapes, tmp_path, monkeypatch
-):
-    histories = []
-    for epochs in ("1", "2"):
-        monkeypatch.setenv("THESIS_REPRO_EPOCHS", epochs)
-        camvid.main(str(tiny_cityscapes))
-        (folder,) = tmp_path.glob("camvid/*/figures")
-        histories.append(pd.read_csv(folder / "figure_4_01.csv"))
-    first, both = histories
-    assert both["epoch"].tolist() == [1, 2] and (both["seconds"] > 0).all()
-    assert both[:1].equals(first)  # the first epoch was not repeated
-    facts = pd.read_csv(folder / "training.csv", index_col="training")["CamVid, seed 0"]
-    assert facts["epochs"] == "2" and facts["ended by early stopping"].startswith("no")
-    scores = pd.read_csv(folder / "scores.csv")
-    assert len(scores.columns) == 3 and (folder / "figure_4_03.webp").is_file()
-
-
-def test_another_backend_has_the_loss_the_scores_and_the_order_of_the_batches():
+def test_any_backend_has_the_loss_the_scores_and_the_order_of_the_batches():
     random = np.random.default_rng(0)
-    labels = random.integers(0, N_CLASSES, (3, 16, 16)).astype(np.uint8)
+    labels = random.integers(0, N_CLASSES, (5, 16, 16)).astype(np.uint8)
     labels[0, :3] = augmentation.NOTHING
     predicted = random.dirichlet(np.full(N_CLASSES, 0.05), labels.shape).astype(np.float32)
     true = augmentation.one_hot(labels, N_CLASSES)
@@ -57,48 +31,58 @@ def test_another_backend_has_the_loss_the_scores_and_the_order_of_the_batches():
     ]
     ours = [
         function(tf.constant(labels), tf.constant(predicted))
-        for function in (
-            camvid_jax.loss_of(CLASS_WEIGHTS),
-            camvid_jax.iou_score,
-            camvid_jax.f1_score,
-        )
+        for function in camvid.loss_and_scores()
     ]
     assert np.allclose([np.mean(value) for value in theirs], ours, rtol=1e-6)
-    images = np.arange(3 * 16 * 16, dtype=np.uint8).reshape(3, 16, 16, 1)
-    batches = training.Batches([(images, labels)], 2, seed=5)
-    other = camvid_jax.Shuffled(images, labels, 2, seed=5)
-    for epoch in range(3):
-        batches.epoch = epoch
-        for (image, label), (other_image, other_label) in zip(
-            batches, map(other.__getitem__, range(2))
-        ):
-            assert (image == other_image).all() and (label == other_label).all()
-        other.on_epoch_end()
+    images = np.arange(5 * 16 * 16).reshape(5, 16, 16, 1).astype(np.uint8)
+    batches = training.Batches([(images, labels)], 4, seed=5)
+    for batches.epoch in range(3):
+        other = camvid.batches_of(images, labels, seed=5, epoch=batches.epoch)
+        for pair, other_pair in zip(batches, other, strict=True):
+            assert all(map(np.array_equal, pair, other_pair))
 
 
-def test_a_job_is_trained_elsewhere_and_its_networks_are_read(
-    tiny_cityscapes, tmp_path, monkeypatch
-):
-    monkeypatch.setenv("THESIS_REPRO_EPOCHS", "1")
-    job, out = tmp_path / "job", tmp_path / "trained"
-    out.mkdir()
-    camvid.main(str(tiny_cityscapes), job=str(job))
-    settings = read_settings()
-    sets = {split: camvid_jax.read_images(job, split) for split in ("train", "val")}
-    batches = camvid.batches_of(tiny_cityscapes, settings.sizes, settings.seed)[0]
-    for written, given in zip(sets["train"], batches.sets[0], strict=True):
-        assert (written == given).all()
-    told = json.loads((job / "job.json").read_text())
-    camvid_jax.train(told, sets, out, 3, time.monotonic() + 600)
-    (out / "machine.txt").write_text("another machine")
-    camvid.main(str(tiny_cityscapes), trained=str(out))
-    (figures,) = tmp_path.glob("camvid/*/figures")
-    history = json.loads((out / "seed_3.json").read_text())
-    row = pd.read_csv(figures / "figure_4_01.csv").iloc[0]
-    assert row["val_loss"] == history[0]["val_loss"] and row["seed"] == 3
-    assert "another machine" in (figures / "training.md").read_text()
-    (network, _), *_ = camvid.read_trained(out, settings.sizes)[0].values()
-    for weights, value in zip(
-        network.get_weights(), np.load(out / "seed_3.npz").values(), strict=True
-    ):
-        assert (weights == value).all()
+def trained(camvid_root, folder, epochs, *more):
+    """Train in a folder, and return the table of the curves, without times."""
+    figures = folder / "figures"
+    where = [str(camvid_root), f"--folder={folder}", f"--figures={figures}"]
+    camvid.main([*where, f"--epochs={epochs}", *more])
+    table = pd.read_csv(figures / "figure_4_01.csv")
+    assert (table.pop("seconds") > 0).all()
+    return table
+
+
+def test_it_writes_curves_scores_and_what_the_thesis_reports(tiny_cityscapes, tmp_path):
+    table = trained(tiny_cityscapes, tmp_path, 1, f"--kitti-semantic={tiny_cityscapes}")
+    assert table["epoch"].tolist() == [1] and table["seed"].tolist() == [0]
+    facts = pd.read_csv(tmp_path / "figures/training.csv", index_col="training")
+    assert list(facts) == ["CamVid, seed 0", "Cityscapes, thesis"]
+    assert facts.loc["ended by early stopping", "CamVid, seed 0"].startswith("no")
+    scores = pd.read_csv(tmp_path / "figures/scores.csv")
+    assert len(scores.columns) == 3 and (tmp_path / "figures/figure_4_03.webp").is_file()
+
+
+@pytest.mark.torture
+def test_a_stopped_training_goes_on_after_its_last_epoch(tiny_cityscapes, tmp_path):
+    whole = trained(tiny_cityscapes, tmp_path / "whole", 2, "--seeds", "0", "1")
+    assert whole["epoch"].tolist() == [1, 2] * 2 and whole["seed"].tolist() == [0, 0, 1, 1]
+    whole = whole[whole["seed"] == 0]
+    first = trained(tiny_cityscapes, tmp_path / "stopped", 1)
+    assert first.equals(whole[:1])
+    state = tmp_path / "stopped/seed_0/state.npz"
+    before = state.read_bytes()
+    assert trained(tiny_cityscapes, tmp_path / "stopped", 2).equals(whole)
+    state.write_bytes(before)  # as if it was stopped before this file was written
+    assert trained(tiny_cityscapes, tmp_path / "stopped", 3)[:2].equals(whole)
+
+
+def test_a_training_ends_if_its_validation_loss_no_longer_falls():
+    rows = [{"val_loss": loss} for loss in (3, 2, 2.5, 2.4, 2.3, 2.2)]
+    assert not camvid.is_done(rows, 100) and not camvid.is_done([], 100)
+    assert camvid.is_done([*rows, {"val_loss": 2.1}], 100)
+    assert camvid.is_done(rows, 6) and not camvid.is_done([*rows, {"val_loss": 1}], 100)
+
+
+def test_a_folder_that_is_missing_ends_at_once(tmp_path):
+    with pytest.raises(InputError, match="nowhere: must be a folder"):
+        camvid.main([str(tmp_path / "nowhere")])

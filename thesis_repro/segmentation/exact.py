@@ -10,7 +10,6 @@ from functools import partial
 from typing import Any
 
 import keras
-import tensorflow as tf
 
 # Keras' own defaults: a user's keras.json may hold others
 keras.config.set_floatx("float32")
@@ -24,8 +23,11 @@ def same_bits(model: Any) -> Any:
     Only this object changes: its weights, its configuration and its file stay Keras' own, and a
     copy that Keras loads from the file normalises as Keras does. Call it before the model is
     compiled or run. Layers with other settings than Keras' defaults (another axis or precision,
-    synchronised or renormalised) and those of a model within the model stay as they are.
+    synchronised or renormalised) and those of a model within the model stay as they are, and all
+    of them with another backend of Keras.
     """
+    if keras.backend.backend() != "tensorflow":
+        return model
     for layer in model.layers:
         if type(layer) is keras.layers.BatchNormalization and _has_usual_settings(layer):
             layer.call = partial(_normalize, layer)
@@ -45,15 +47,17 @@ def _has_usual_settings(layer: keras.layers.BatchNormalization) -> bool:
 
 def _normalize(
     layer: keras.layers.BatchNormalization,
-    inputs: tf.Tensor,
+    inputs: Any,
     training: bool | None = None,
-    mask: tf.Tensor | None = None,
-) -> tf.Tensor:
+    mask: Any = None,
+) -> Any:
     """Return gamma * (inputs - mean) / sqrt(variance + epsilon) + beta.
 
     In training, mean and variance are those of the batch, and the layer's moving averages follow
     them; otherwise they are the moving averages. mask: Keras gives one, but images have none.
     """
+    import tensorflow as tf  # another backend of Keras may be without it
+
     mean, variance = layer.moving_mean, layer.moving_variance
     if training and layer.trainable:
         mean, variance = keras.ops.moments(inputs, axes=list(range(len(inputs.shape) - 1)))
