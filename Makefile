@@ -71,54 +71,31 @@ setup: .venv/ready $(if $(filter 1,$(GPU)),.venv/ready-gpu)
 	@$(call install,-r environment-gpu.txt) && touch $@
 
 figures: setup
-	@$(BIN)/python -m thesis.figures
+	@$(BIN)/python -m thesis.run
 book: setup
 	@$(BIN)/python -m thesis.book
 page: setup
 	@$(BIN)/python tools/write_texts.py
 	@$(BIN)/python -m thesis.gallery
 
-# Which notebook needs what; `thesis.figures` runs this with the folder of the run. A notebook is executed again if one that
-# it needs was, or if the digests of the data or of its code have changed (thesis/checked.py, thesis/used.py). `done` has the
-# contents that each was made from; by these, used.py sets the dates that are compared here. With real
-# frames and no Cityscapes, the shipped model makes the label maps, so nothing is rendered or trained.
-NAMES := 01_load_images_and_labels 02_augmentation 03_unet 04_training 05_prediction 06_keypoint_masks 07_visual_odometry \
-         08_results 09_audit
+# `thesis.run` deletes what is out of date, writes into needs.mk which notebook needs which, and calls this with the folder of
+# the run. A notebook that exists is done, whatever its date; nbconvert writes under another name. Its kernel has nothing to do
+# at its end.
 ifdef RUN
-needed := $(if $(or $(THESIS_REPRO_CITYSCAPES),$(if $(THESIS_REPRO_KITTI),,embedded)),$(NAMES),$(filter-out 01_% 02_% 04_%,$(NAMES)))
-executed = $(patsubst %,$(RUN)/notebooks/%.ipynb,$(filter $(addsuffix _%,$(1)),$(needed)))
-
-notebooks: $(needed:%=$(RUN)/notebooks/%.ipynb)
-$(call executed,02 04 05 09): $(call executed,01)
-$(call executed,04): $(call executed,02 03)
-$(call executed,05 09): $(call executed,04)
-$(call executed,06 07 08 09): $(call executed,05)
-$(call executed,07 08 09): $(call executed,06)
-# 09 waits for 08, or only for LAST, if this is given: the last file of 08 that it reads. While a notebook is executed, done/
-# has its name with a dot. make starts 08 before `tables`; after a second, 08 has surely begun.
-LAST :=
-$(call executed,09): $(if $(LAST),$(RUN)/code/08_results | tables,$(call executed,08))
-.PHONY: tables
-tables: $(call executed,06)
-	@cd $(RUN)/done && sleep 1; while test -e .08_results && ! test ../$(LAST) -nt .08_results; do sleep 1; done; \
-	test -e .08_results || test -e 08_results
-
-# nbconvert writes under another name: a notebook that exists is done. Its kernel has nothing to do at its end.
-$(RUN)/notebooks/%.ipynb: $(RUN)/code/% $(RUN)/checked
-	@trap 'kill $$!; rm -f $(RUN)/done/.$*; exit 130' INT TERM HUP; rm -f $(RUN)/done/$*; : >$(RUN)/done/.$*; \
+include $(RUN)/needs.mk
+$(RUN)/notebooks/%.ipynb:
+	@trap 'kill $$!; exit 130' INT TERM HUP; \
 	$(BIN)/python -m nbconvert --to notebook --execute --ExecutePreprocessor.kernel_name=python3 \
 	  --ExecutePreprocessor.timeout=-1 --ExecutePreprocessor.shutdown_kernel=immediate \
 	  --output-dir $(@D) --output .$* notebooks/$*.ipynb >$(@:.ipynb=.log) 2>&1 & wait $$! \
-	&& mv $(@D)/.$*.ipynb $@ && (cd $(RUN) && cksum $(^:$(RUN)/%=%) >done/.$* && mv done/.$* done/$*) && echo "$*: done in $$SECONDS s" \
-	|| { rm -f $(RUN)/done/.$*; echo "$* failed: $$($(call reason,$(@:.ipynb=.log))) ($(@:.ipynb=.log))" >&2; exit 1; }
+	&& mv $(@D)/.$*.ipynb $@ && echo "$*: done in $$SECONDS s" \
+	|| { echo "$* failed: $$($(call reason,$(@:.ipynb=.log))) ($(@:.ipynb=.log))" >&2; exit 1; }
+# The drives of the embedded world, and the shared odometry compiled, while the network is trained.
+$(RUN)/drives:
+	@nice $(BIN)/python tools/drives.py && touch $@
 # The last line of a log is the error, but not if the kernel died: then it is what the kernel said, or else memory ran out.
 reason = tr -d '\033' <$(1) | sed 's/\[[0-9;]*m//g' | awk '/^F[0-9]|^Fatal Python error|what\(\):/ && !said {said = $$0} NF {last = $$0} \
   END {print last !~ /DeadKernelError/ ? last : said ? said : "its kernel was killed, most likely because memory ran out"}'
-$(RUN)/checked $(NAMES:%=$(RUN)/code/%): ;
-# Render the drives of the embedded world and compile the shared odometry while the network is trained, to save time.
-$(call executed,05): $(if $(THESIS_REPRO_KITTI),,$(RUN)/drives)
-$(RUN)/drives: $(call executed,01)
-	@nice $(BIN)/python tools/drives.py && touch $@
 endif
 
 check-data: setup
@@ -133,7 +110,7 @@ lint: setup
 # Lessons edit copies, so that the notebooks in git stay as they are. An edited copy is kept.
 lab: setup
 	@lab=$$($(BIN)/python -m thesis.settings) && lab=$${lab%/*}/lab && mkdir -p "$$lab" && \
-	for path in $(NAMES:%=%.ipynb) thesis; do test -e "$$lab/$$path" || cp -r notebooks/$$path "$$lab"; done && \
+	for path in notebooks/0[1-9]_*.ipynb notebooks/thesis; do test -e "$$lab/$${path#*/}" || cp -r "$$path" "$$lab"; done && \
 	echo "the notebooks are copies in $$lab; delete one to get it anew. One that was idle for an hour loses its memory:" && \
 	echo "run its cells again. Open the address below:" && \
 	THESIS_REPRO_PROFILE=$(or $(THESIS_REPRO_PROFILE),lab) PYTHONPATH="$(CURDIR)" $(BIN)/python -m jupyter lab "$$lab" --log-level=ERROR \
@@ -145,7 +122,7 @@ bench: setup
 excerpts: setup
 	@$(BIN)/python tools/excerpts.py "$(KITTI)" "$(RAW)"
 evidence: setup
-	@THESIS_REPRO_PROFILE=thesis $(BIN)/python -m thesis.figures
+	@THESIS_REPRO_PROFILE=thesis $(BIN)/python -m thesis.run
 	@THESIS_REPRO_PROFILE=thesis $(BIN)/python tools/evidence.py
 	@$(BIN)/python tools/write_texts.py
 timings: setup

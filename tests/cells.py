@@ -1,7 +1,6 @@
-"""The cells of the notebooks in git, and which of them make executes."""
+"""The cells of the notebooks in git."""
 
 import json
-import re
 
 from thesis.settings import ROOT
 
@@ -23,8 +22,3 @@ def cells(name, kind):
 def code_of(name):
     """The code of a notebook."""
     return "\n".join(cells(name, "code").values())
-
-
-def executed_by(commands):
-    """The numbers of the notebooks that commands execute, from the output of make."""
-    return sorted(re.findall(r"--output \.(\d\d)_", commands.replace("\\\n", "")))

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from thesis import checked
+from thesis import run
 from thesis.settings import read_settings
 from thesis_repro import checks
 from thesis_repro.command.cli import main
@@ -76,7 +76,7 @@ def test_unchanged_data_is_checked_once(tiny_kitti, tmp_path, capsys):
         if frame is not None:
             images = tiny_kitti / IMAGES
             shutil.copy(images / "000001.png", images / f"{frame:06d}.png")
-        assert checked.check(settings)
+        assert run.check(settings)
         assert (str(tiny_kitti) in capsys.readouterr().out) == reports
 
 

@@ -123,13 +123,6 @@ def test_a_type_checker_sees_the_types_of_the_main_names(tmp_path):
     assert wrong == [("2", "arg-type"), ("3", "arg-type"), ("4", "attr-defined")]
 
 
-def plan(root, *options, **changes):
-    """What `make notebooks` would execute in a run's folder, from its output."""
-    where = succeed([sys.executable, "-m", "thesis.settings"], root, **changes)
-    words = ["make", "-n", "-o", ".venv/ready", "notebooks", f"RUN={where.stdout.strip()}"]
-    return succeed([*words, *options], root, **changes).stdout
-
-
 @pytest.fixture
 def checkout(tmp_path):
     """A folder with the Makefile, and an environment that make takes for its own."""
@@ -140,12 +133,11 @@ def checkout(tmp_path):
     return tmp_path
 
 
-def test_make_reads_settings_from_its_arguments_and_the_environment(checkout):
+def test_make_that_only_plans_writes_nothing(checkout):
     figures = ["make", "-o", ".venv/ready", "figures", f"FIGURES={checkout}/figures"]
     before = snapshot(checkout)
     planned = succeed([*figures, "-n", "PROFILE=smoke"], checkout)
-    assert "thesis.figures" in planned.stdout and snapshot(checkout) == before  # nothing is written
-    assert "/embedded-demo/notebooks/01_load" in plan(checkout, THESIS_REPRO_BUILD="other")
+    assert "thesis.run" in planned.stdout and snapshot(checkout) == before
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import pytest
 
 import evidence
 import excerpts as command
-from thesis import checked, excerpts
+from thesis import excerpts, run
 from thesis.settings import read_settings
 from thesis_repro.data.sequence import Sequence
 from thesis_repro.errors import InputError
@@ -53,7 +53,7 @@ def test_ranges_of_frames_are_a_run_of_their_own(tiny_kitti, tmp_path):
     given = {"KITTI": tiny_kitti, "BUILD": tmp_path / "build", "PROFILE": "smoke"}
     settings = settings_of(FRAMES="01:1-3", **given)
     assert settings.run.endswith("-smoke-frames-all-01_1_3") and settings.sizes.frames is None
-    assert checked.check(settings)
+    assert run.check(settings)
     (part,) = evidence.opened(settings)
     assert (part.name, len(part)) == ("01", 3)
     assert settings_of(FRAMES="2", **given).kitti == tiny_kitti

@@ -4,7 +4,7 @@ import pandas as pd
 import pytest
 
 from keypoint_study.sources import Source
-from thesis import excerpts, figures, timing
+from thesis import excerpts, timing
 from thesis.settings import ROOT, read_settings
 from thesis_repro.data.sequence import Sequence
 
@@ -19,7 +19,6 @@ def settings(tmp_path):
 
 
 def test_a_run_shows_its_own_times_with_machine_date_version_and_sizes(settings):
-    assert not figures.shows_times_of_git(settings)
     table = timing.recorded(settings, "seconds", MEASURED)
     assert table["seconds"].tolist() == [0.25] and table["sequence"].tolist() == ["00"]
     told = timing.told(table)
@@ -39,10 +38,8 @@ def test_what_a_machine_measures_changes_no_figure_in_git(monkeypatch, tmp_path,
         monkeypatch.setattr(excerpts, "is_evidence", lambda _: True)
         monkeypatch.setattr(excerpts, "FOLDER", tmp_path / "evidence")
         folder = tmp_path / "evidence/timings"
-        assert not figures.shows_times_of_git(settings)  # the audit waits for the run's own
         folder.mkdir(parents=True)
         MEASURED.assign(seconds=7.0, processor="another").to_csv(folder / "seconds.csv")
-    assert figures.shows_times_of_git(settings)
     before = (folder / "seconds.csv").read_bytes()
     shown = timing.recorded(settings, "seconds", MEASURED)
     assert len(shown) and 0.25 not in shown["seconds"].tolist()

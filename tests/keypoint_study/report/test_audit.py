@@ -18,7 +18,7 @@ from thesis import (
     audit_of_data,
     audit_of_tables,
     domain_gap,
-    figures,
+    run,
 )
 from thesis.settings import ROOT
 from thesis_repro.data.cityscapes import ID
@@ -203,7 +203,7 @@ def test_the_quality_of_label_maps_is_recorded(tmp_path):
 
 # A run is told whether its network is the recorded one
 
-RECORDED = figures.RECORDED_NETWORK
+RECORDED = run.RECORDED_NETWORK
 
 
 @pytest.mark.parametrize(
@@ -218,6 +218,6 @@ RECORDED = figures.RECORDED_NETWORK
 def test_the_networks_are_compared(tmp_path, network, in_git, named):
     if network:
         provenance.stage(tmp_path / "labels" / "00", model=network)
-    note = figures.network_note(SimpleNamespace(build=tmp_path, figures_in_git=in_git))
+    note = run.network_note(SimpleNamespace(build=tmp_path, figures_in_git=in_git))
     assert bool(note) == bool(named) and all(name in note for name in named)
     assert ("XLA_FLAGS" in note) == (len(named) > 1)
