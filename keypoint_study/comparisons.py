@@ -19,7 +19,7 @@ import pandas as pd
 
 from keypoint_study import methods, ratios, verdicts
 from keypoint_study.jobs import CONTROL_WIDTH, ESTIMATOR_TITLES
-from keypoint_study.methods import MASK_CONTROLS
+from keypoint_study.methods import MASK_CONTROLS, METHODS
 from keypoint_study.path_errors import ERRORS
 from keypoint_study.sources import UNMASKED
 from keypoint_study.verdicts import verdict
@@ -27,12 +27,10 @@ from keypoint_study.verdicts import verdict
 # {name: title} of the methods and errors that are compared. The judging metrics decide.
 METHOD_TITLES = {
     name: method.title
-    for name, method in methods.METHODS.items()
-    if method.group != methods.THESIS_ONLY
+    for name, method in METHODS.items()
+    if method.group in (methods.BROUGHT, methods.LABEL_MAPS, methods.CONTROL)
 }
-SEGMENTATION_FREE_CONTROLS = [
-    name for name, method in methods.METHODS.items() if method.group == methods.CONTROL
-]
+SEGMENTATION_FREE_CONTROLS = methods.of_group(methods.CONTROL)
 BROUGHT = ("masked", *UNMASKED)  # methods of what a user brings; the others are controls
 METRIC_TITLES = {name: error.title for name, error in ERRORS.items()}
 JUDGING_METRICS = {name: error.title for name, error in ERRORS.items() if error.decides}

@@ -120,7 +120,7 @@ def runs_of(
         if method in UNMASKED:
             brought = replace(given, folder=given.file(sequence))
             return Run(frames, THESIS, brought=brought)
-        asked = Asked(frames, given, CONTROL_WIDTH if width is None else width, number)
+        asked = Asked(frames, given, CONTROL_WIDTH if width is None else width, number or 0)
         try:
             own, masks = METHODS[method].choose(asked)
         except InputError as error:

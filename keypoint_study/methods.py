@@ -1,12 +1,12 @@
 """What is compared: one table of ways to choose keypoints, METHODS.
 
-Studies, tables of few keypoints and ablations select from it. Beside all keypoints and
-masks, there are *controls*: masks and settings that leave as many keypoints as the masks of the
-segmentation, chosen differently. If the odometry gains as much from a control, the segmentation is
-not what helps. A new method is a function and an entry in METHODS.
+Studies, tables of few keypoints and ablations select from it. Beside all keypoints and masks, there
+are *controls*: masks and settings that leave as many keypoints as the masks of the segmentation,
+chosen differently. If the odometry gains as much from a control, the segmentation is not what
+helps. A new method is a function and an entry in METHODS.
 """
 
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple, TypeAlias
 
@@ -26,7 +26,6 @@ from thesis_repro.odometry.keypoints import filled, filtered, orb, spread
 # the width of lines and edges as controls. It was fixed before any run. (The code of appendix A.8
 # dilates by 5, audit row 26.)
 CONTROL_WIDTH = 10
-FEW_SPREAD = 200  # keypoints spread on or off the masks
 FILL = 5  # keypoints in each of 16 x 5 fields of the frame, for masks that are filled
 # All corrections together. No error was used to choose them: a label map of 320 columns places a
 # boundary within about 2 pixels of the frame, and within 10 pixels of its border the Lucas-Kanade
@@ -42,14 +41,13 @@ Choice: TypeAlias = tuple[OdometrySettings, Any]  # settings and masks of a run,
 class Asked(NamedTuple):
     """What a method chooses for.
 
-    width: pixels, of masks that have one, and of lines. number: of keypoints, 0 for no limit; None
-    if nobody says.
+    width: pixels, of masks that have one, and of lines. number: of keypoints, 0 for no limit.
     """
 
     sequence: Sequence
     source: Source
     width: int = CONTROL_WIDTH
-    number: int | None = None
+    number: int = 0
 
 
 def all_keypoints(asked: Asked) -> Choice:
@@ -67,7 +65,9 @@ def strongest(choose: Callable[[Asked], Choice]) -> Callable[[Asked], Choice]:
 
     def limited(asked: Asked) -> Choice:
         settings, masks = choose(asked)
-        return (replace(settings, max_keypoints=asked.number) if asked.number else settings), masks
+        if asked.number:
+            settings = replace(settings, max_keypoints=asked.number)
+        return settings, masks
 
     return limited
 
@@ -79,12 +79,12 @@ def drawn(asked: Asked) -> Choice:
 
 def spread_out(asked: Asked) -> Choice:
     """Run with keypoints that are spread over the frame."""
-    return replace(THESIS, detector=spread(asked.number or FEW_SPREAD)), None
+    return replace(THESIS, detector=spread(asked.number)), None
 
 
 def drawn_on_masks(asked: Asked) -> Choice:
     """Run with random keypoints of those on the masks, as many as are asked for."""
-    values = asked.sequence, asked.number or FEW_SPREAD
+    values = asked.sequence, asked.number
     return THESIS, MadeMasks(ablations.random_keypoints_on, masked(asked)[1], values)
 
 
@@ -93,9 +93,9 @@ def altered(make: Callable, *values: Any) -> Callable[[Asked], Choice]:
     return lambda asked: (THESIS, MadeMasks(make, masked(asked)[1], values))
 
 
-def with_lines(make: Callable) -> Callable[[Asked], Choice]:
-    """Return a method with lines of the masks' width, that a function makes from the masks."""
-    return lambda asked: altered(make, asked.width)(asked)
+def random_lines(asked: Asked) -> Choice:
+    """Run with random lines as wide as those of masks."""
+    return altered(controls.random_lines, asked.width)(asked)
 
 
 def image_edges(asked: Asked) -> Choice:
@@ -149,71 +149,34 @@ def changed(own: OdometrySettings, changes: Mapping[str, Any]) -> OdometrySettin
     return replace(own, **{name: value for name, value in changes.items() if name in free})
 
 
-# Where a method is compared, and with how many keypoints
-
-# studies with controls; chapter 4, ablations and few keypoints of the notebooks
-STUDY, CHAPTER_4, ABLATIONS, FEW = "study", "chapter 4", "ablations", "few"
-# all that it leaves; each number of a list; as many as masks leave
-ALL, EACH, AS_MANY = 0, "each", "as many"
-IN_STUDY: Mapping[str, Collection] = {STUDY: {ALL}}
-ABLATION: Mapping[str, Collection] = {ABLATIONS: {ALL}}
+# The table
 
 
 class Method(NamedTuple):
     """A way to choose the keypoints of a run.
 
-    title: in tables and figures. group: REFERENCE, without masks; with the masks BROUGHT by a user,
-    or these ALTERED; OWN keypoints or paths of a user; from LABEL_MAPS of the user; a CONTROL
-    without segmentation, which keeps as many pixels or keypoints as the masks do but knows nothing
-    of the classes; or THESIS_ONLY, for the thesis's figures and the audit. choose: from what is
-    asked to the settings and masks of a run. Its own settings win over those of a study. where: in
-    what it is compared, with how many keypoints.
+    title: in tables and figures. group: who compares it. BROUGHT: every study. LABEL_MAPS and
+    CONTROL: studies with controls; the first are other masks from a user's label maps, the second
+    know nothing of the classes in the frame and keep as many pixels or keypoints as the masks do.
+    FEW, ABLATION, CHAPTER_4: the notebooks. choose: from what is asked to the settings and masks of
+    a run; its own settings win over those of a study. numbered: whether its jobs say how many
+    keypoints, or how far apart they are.
     """
 
     title: str
     group: str
     choose: Callable[[Asked], Choice]
-    where: Mapping[str, Collection] = IN_STUDY
+    numbered: bool = False
 
 
-REFERENCE, BROUGHT, OWN, ALTERED, LABEL_MAPS, CONTROL, THESIS_ONLY = (
-    "reference",
-    "brought",
-    "own",
-    "altered",
-    "label maps",
-    "control",
-    "thesis",
-)
-
-
-def ablation(choose: Callable[[Asked], Choice]) -> Method:
-    """Return a method that differs from the thesis in one thing, for the audit."""
-    return Method("", THESIS_ONLY, choose, ABLATION)
-
-
+BROUGHT, LABEL_MAPS, CONTROL = "brought", "label maps", "control"
+FEW, ABLATION, CHAPTER_4 = "few keypoints", "ablation", "chapter 4"
 METHODS = {  # in the order in which they are shown
-    "baseline": Method(
-        "all keypoints",
-        REFERENCE,
-        all_keypoints,
-        {STUDY: {ALL}, ABLATIONS: {ALL}, FEW: {ALL}},
-    ),
-    "masked": Method("masks", BROUGHT, masked, {STUDY: {ALL}, ABLATIONS: {ALL}}),
+    "baseline": Method("all keypoints", BROUGHT, all_keypoints),
+    "masked": Method("masks", BROUGHT, masked),
     # these two as sources.KINDS has them
-    "keypoints": Method("own keypoints", OWN, all_keypoints),
-    "paths": Method("path of another system", OWN, all_keypoints, {STUDY: {ALL}}),
-    "filter": ablation(found_by(filtered, masked)),
-    "symmetric": ablation(with_masks(symmetric=True)),
-    "no-vegetation": ablation(altered(ablations.without_vegetation)),
-    "strongest": Method("strongest keypoints", REFERENCE, strongest(all_keypoints), {FEW: {EACH}}),
-    "random": Method("random ones", REFERENCE, drawn, {FEW: {EACH}}),
-    "spread-anywhere": Method("spread keypoints", REFERENCE, spread_out, {FEW: {EACH}}),
-    "strongest-on": Method(
-        "strongest on the masks", BROUGHT, strongest(masked), {FEW: {ALL, EACH}}
-    ),
-    "random-on": Method("random on the masks", BROUGHT, drawn_on_masks, {FEW: {FEW_SPREAD}}),
-    "filled": Method("masks, filled", ALTERED, found_by(filled(FILL), masked), {FEW: {ALL}}),
+    "keypoints": Method("own keypoints", BROUGHT, all_keypoints),
+    "paths": Method("path of another system", BROUGHT, all_keypoints),
     "exact-boundaries": Method(
         "exact class boundaries", LABEL_MAPS, with_masks(boundaries="exact", keep="boundaries")
     ),
@@ -226,53 +189,43 @@ METHODS = {  # in the order in which they are shown
     "true-labels": Method("true label maps", LABEL_MAPS, from_true_labels),
     "other-frame": Method("mask of another frame", CONTROL, altered(controls.other_frame)),
     "mirrored": Method("mirrored mask", CONTROL, altered(controls.mirrored)),
-    "random-lines": Method("random lines", CONTROL, with_lines(controls.random_lines)),
+    "random-lines": Method("random lines", CONTROL, random_lines),
     "image-edges": Method("edges of the image", CONTROL, image_edges),
-    # their jobs say how many keypoints, or how far apart (`runner.keypoint_controls`)
-    "fewer": Method("fewer keypoints", CONTROL, strongest(all_keypoints), {STUDY: {AS_MANY}}),
-    "spread": Method("keypoints spread out", CONTROL, all_keypoints, {STUDY: {AS_MANY}}),
-    "reduced": Method(  # Figure 4.12
-        "reduced keypoints", THESIS_ONLY, strongest(all_keypoints), {CHAPTER_4: {AS_MANY}}
+    "fewer": Method("fewer keypoints", CONTROL, strongest(all_keypoints), numbered=True),
+    "spread": Method("keypoints spread out", CONTROL, all_keypoints, numbered=True),
+    # Figure 4.12
+    "reduced": Method("reduced keypoints", CHAPTER_4, strongest(all_keypoints), numbered=True),
+    "strongest": Method("the strongest", FEW, strongest(all_keypoints), numbered=True),
+    "random": Method("random ones", FEW, drawn, numbered=True),
+    "spread-anywhere": Method("spread over the frame", FEW, spread_out, numbered=True),
+    "strongest-on": Method("the strongest on the mask", FEW, strongest(masked), numbered=True),
+    "random-on": Method("random ones on the mask", FEW, drawn_on_masks, numbered=True),
+    "filled": Method(f"mask, filled to {FILL} a field", FEW, found_by(filled(FILL), masked)),
+    "filter": Method("dropped off the mask", ABLATION, found_by(filtered, masked)),
+    "symmetric": Method("symmetric dilation", ABLATION, with_masks(symmetric=True)),
+    "no-vegetation": Method("all but vegetation", ABLATION, altered(ablations.without_vegetation)),
+    "dropout": Method("nine tenths", ABLATION, of_sequence(ablations.random_keypoints, 0.9)),
+    # pixels of parallax that are kept: the first two leave out distant points, the last near ones
+    "parallax-1": Method("1 or more", ABLATION, of_sequence(ablations.with_parallax, 1, np.inf)),
+    "as many as parallax-1": Method("as many", ABLATION, of_sequence(ablations.as_many, 1, np.inf)),
+    "parallax-3": Method("3 or more", ABLATION, of_sequence(ablations.with_parallax, 3, np.inf)),
+    "as many as parallax-3": Method("as many", ABLATION, of_sequence(ablations.as_many, 3, np.inf)),
+    "parallax-20": Method("below 20", ABLATION, of_sequence(ablations.with_parallax, 0, 20)),
+    "as many as parallax-20": Method("as many", ABLATION, of_sequence(ablations.as_many, 0, 20)),
+    "turned-into": Method("half turned into", ABLATION, of_sequence(ablations.half_in_turns, True)),
+    "turned-from": Method(
+        "half turned from", ABLATION, of_sequence(ablations.half_in_turns, False)
     ),
-}
-# pixels that are kept; the first two leave out distant points, the last near ones
-PARALLAX = {"parallax-1": (1, np.inf), "parallax-3": (3, np.inf), "parallax-20": (0, 20)}
-METHODS |= {
-    "dropout": ablation(of_sequence(ablations.random_keypoints, 0.9)),
-    **{
-        prefix + name: ablation(of_sequence(make, *span))
-        for name, span in PARALLAX.items()
-        for prefix, make in (("", ablations.with_parallax), ("as many as ", ablations.as_many))
-    },
-    "turned-into": ablation(of_sequence(ablations.half_in_turns, True)),
-    "turned-from": ablation(of_sequence(ablations.half_in_turns, False)),
-    "orb": ablation(found_by(orb, all_keypoints)),
+    "orb": Method("ORB", ABLATION, found_by(orb, all_keypoints)),
 }
 # the methods with masks beside "masked", which the tested width of a study is for
 MASK_CONTROLS = [
     name
     for name, method in METHODS.items()
-    if method.group in (CONTROL, LABEL_MAPS) and AS_MANY not in method.where.get(STUDY, ())
+    if method.group in (LABEL_MAPS, CONTROL) and not method.numbered
 ]
-AS_SLAM_SYSTEMS = ("static", "inverse", "static-boundaries")
 
 
-def compared_in(place: str) -> list[str]:
-    """Return the names of the methods that are compared in a place."""
-    return [name for name, method in METHODS.items() if place in method.where]
-
-
-def with_numbers(place: str, numbers: Iterable[int]) -> list[tuple[str, int]]:
-    """Return (method, number of keypoints) for each number, 0 for no limit, in a place.
-
-    Those that the place has with a number of their own come last.
-    """
-    asked = {name: METHODS[name].where[place] for name in compared_in(place)}
-    each = [
-        (name, number)
-        for number in numbers
-        for name in asked
-        if (EACH if number else ALL) in asked[name]
-    ]
-    own = [(name, number) for name in asked for number in asked[name]]
-    return each + [(name, number) for name, number in own if number not in (ALL, EACH, AS_MANY)]
+def of_group(group: str) -> list[str]:
+    """Return the names of the methods of a group."""
+    return [name for name, method in METHODS.items() if method.group == group]

@@ -20,7 +20,7 @@ import pandas as pd
 from keypoint_study import comparisons
 from keypoint_study.controls import min_distance, recorded
 from keypoint_study.jobs import Job, Run, repeated
-from keypoint_study.methods import AS_MANY, METHODS, STUDY
+from keypoint_study.methods import CONTROL, METHODS, of_group
 from keypoint_study.path_errors import path_errors
 from keypoint_study.sources import Source
 from thesis_repro import odometry
@@ -343,7 +343,7 @@ def number_warnings(runs: pd.DataFrame, sources: Iterable[Source]) -> list[str]:
     for source in sources:
         wanted = comparisons.keypoints_left(runs, source.name)
         of_source = runs[runs["source"] == source.name]
-        for name in [n for n, method in METHODS.items() if AS_MANY in method.where.get(STUDY, ())]:
+        for name in [name for name in of_group(CONTROL) if METHODS[name].numbered]:
             rows = of_source[of_source["method"] == name]
             ratios = rows.groupby("sequence")["mean_keypoints"].mean() / wanted
             off = np.log(ratios.dropna()).abs()

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 from cv2 import INTER_NEAREST, resize
 
-from thesis import ablations, artefacts, audit_of_tables, domain_gap, earlier, timing
+from thesis import artefacts, audit_of_tables, audit_runs, domain_gap, earlier, timing
 from thesis.audit import measurement, ratio
 from thesis.audit_of_tables import TIME_OF_NARROW, TIME_TOGETHER, TIME_TYPICAL, WIDTHS
 from thesis.settings import Settings
@@ -35,7 +35,7 @@ def measurements_of_run(
     sequence whose boundaries are measured. Writes ablations.csv.
     """
     labels = earlier.label_maps()
-    ablated = ablations.run_ablations(
+    ablated = audit_runs.run_ablations(
         drives, labels, settings.build / "audit", repetitions, settings.jobs
     )
     artefacts.write_text("ablations.csv", ablated.to_csv(index=False))
@@ -48,7 +48,7 @@ def measurements_of_run(
 
 
 def boundaries(drives: list[Sequence], labels: Path, pairs: int) -> pd.DataFrame:
-    """Measure the boundaries of label maps; returns one row a frame (see `ablations.boundaries`).
+    """Measure the boundaries of label maps; returns one row a frame (see `audit_runs.boundaries`).
 
     Thin objects are those of the exact label maps, if there are any.
     """
@@ -58,8 +58,8 @@ def boundaries(drives: list[Sequence], labels: Path, pairs: int) -> pd.DataFrame
         for index in range(0, len(drive), max(1, len(drive) // pairs)):
             name = drive.frame_paths[index].name
             thin_map = read_label_map((exact if exact.is_dir() else own) / name)
-            shares = ablations.boundaries(read_label_map(own / name), drive.size)
-            shares |= ablations.thin_boundaries(thin_map, drive.size)
+            shares = audit_runs.boundaries(read_label_map(own / name), drive.size)
+            shares |= audit_runs.thin_boundaries(thin_map, drive.size)
             rows.append({"sequence": drive.name, "frame": index} | shares)
     return pd.DataFrame(rows)
 

@@ -257,7 +257,7 @@ def _of_null_distribution(shuffled: pd.DataFrame, widths: int) -> list[dict[str,
 
 
 def of_ablations(runs: pd.DataFrame) -> list[dict[str, Any]]:
-    """Return the rows that follow from the runs of `ablations.run_ablations`."""
+    """Return the rows that follow from the runs of `audit_runs.run_ablations`."""
     run = partial(of_method, runs)
     every, masks, half = run("baseline"), run("masked"), run("turned-into")
     no_trees = "no keypoints on vegetation and terrain, over all keypoints"

@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 
 from keypoint_study import comparisons, jobs, ratios
 from keypoint_study.jobs import Job, repeated, runs_of
-from keypoint_study.methods import FEW, FILL, METHODS, compared_in, with_numbers
+from keypoint_study.methods import FEW, METHODS, of_group
 from keypoint_study.report import style, texts
 from keypoint_study.runner import run_all
 from keypoint_study.sources import Source
@@ -36,14 +36,8 @@ REPETITIONS = 4  # three of them with the matched points shuffled
 TIMED_RUNS = 5
 # {method: its name in the tables}, if that is another one
 CALLED = {"baseline": "all", "strongest-on": "mask", "spread-anywhere": "spread"}
-# {name in the tables: title}. A new method has the title that METHODS gives it.
-LABELS = {CALLED.get(name, name): METHODS[name].title for name in compared_in(FEW)} | {
-    "strongest": "the strongest",
-    "spread": "spread over the frame",
-    "mask": "the strongest on the mask",
-    "random-on": "random ones on the mask",
-    "filled": f"mask, filled to {FILL} a field",
-}
+# {name in the tables: title}
+LABELS = {CALLED.get(name, name): METHODS[name].title for name in ("baseline", *of_group(FEW))}
 COLUMNS = (
     "sequence",
     "choice",
@@ -65,10 +59,15 @@ def jobs_of(sequence: Sequence, numbers: Iterable[int] = ()) -> dict[tuple[str, 
 
     numbers: NUMBERS if there are none.
     """
-    named = with_numbers(FEW, (0, *(numbers or NUMBERS)))
+    few = of_group(FEW)
+    asked = [("baseline", 0), ("strongest-on", 0)]
+    asked += [(name, 0) for name in few if not METHODS[name].numbered]
+    each = [name for name in few if METHODS[name].numbered and name != "random-on"]
+    asked += [(name, number) for number in numbers or NUMBERS for name in each]
+    asked.append(("random-on", 200))
     return {
         (CALLED.get(name, name), number): Job(sequence.name, name, max_keypoints=number)
-        for name, number in named
+        for name, number in asked
     }
 
 

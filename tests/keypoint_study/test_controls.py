@@ -14,7 +14,7 @@ from keypoint_study.jobs import first_jobs, runs_of
 from keypoint_study.methods import Asked
 from keypoint_study.sources import Source
 from thesis import section_4_2
-from thesis.ablations import boundaries
+from thesis.audit_runs import boundaries
 from thesis_repro import masks
 from thesis_repro.data.sequence import Sequence
 from thesis_repro.masks import folders
@@ -100,9 +100,9 @@ def test_a_methods_own_settings_win_over_those_of_a_study(sequence, small_labels
     assert filled.detector == keypoints.filled(methods.FILL, keypoints.spread(200))
 
 
-@pytest.mark.parametrize("place, count", [(methods.ABLATIONS, 15), (methods.FEW, 7)])
-def test_ablations_and_few_keypoints_are_those_of_the_one_table(place, count):
-    assert len(methods.compared_in(place)) == count
+@pytest.mark.parametrize("group, count", [(methods.ABLATION, 13), (methods.FEW, 6)])
+def test_ablations_and_few_keypoints_are_those_of_the_one_table(group, count):
+    assert len(methods.of_group(group)) == count
 
 
 MADE_FROM = {  # another value of each argument
@@ -198,7 +198,7 @@ def test_controls_leave_as_many_keypoints_as_masks_of_the_tested_width(
 
 def test_every_ablation_differs_from_its_reference_in_one_thing(small_world, small_labels):
     sequence = Sequence(small_world / "kitti", "00").subset(4)
-    listed = [jobs.Job("00", name) for name in methods.compared_in(methods.ABLATIONS)]
+    listed = [jobs.Job("00", name) for name in ("masked", *methods.of_group(methods.ABLATION))]
     made = runs_of(listed, [sequence], [Source(small_labels)])
     runs = {job.method: (run.settings, run.masks) for job, run in made.items()}
     settings, thesis_masks = runs["masked"]

@@ -193,10 +193,10 @@ def test_first_jobs_are_complete_and_have_different_names(small_world, tiny_kitt
     assert count["ready", "masked", "refined"] == 2
     assert rows.loc[rows["source"] == "ready", "dilation_width"].isna().all()
     net, ready_made = (set(rows.loc[rows["source"] == name, "method"]) for name in ("net", "ready"))
-    # no list names them: what is in the table runs, unless it waits to be asked for
-    groups = {name: methods.METHODS[name].group for name in methods.compared_in(methods.STUDY)}
-    of_labels = {name for name, group in groups.items() if group == methods.LABEL_MAPS}
-    controls = {name for name, group in groups.items() if group == methods.CONTROL}
+    # no list names them: what is in the table runs
+    of_labels, controls = (
+        set(methods.of_group(group)) for group in (methods.LABEL_MAPS, methods.CONTROL)
+    )
     assert net == {"masked", *of_labels, *controls} - {"fewer", "spread"}
     assert controls == {
         *["other-frame", "mirrored", "random-lines", "image-edges", "fewer", "spread"]

@@ -49,7 +49,7 @@ TABLES = {
     ),
     "thesis_repro/odometry/keypoints.py": (("(orb, ", "(orb, mine, "),),
     "keypoint_study/methods.py": (
-        ("METHODS = {", "METHODS = {'mine': Method('mine', CONTROL, all_keypoints, {}),"),
+        ("METHODS = {", "METHODS = {'mine': Method('mine', CONTROL, all_keypoints),"),
     ),
 }
 

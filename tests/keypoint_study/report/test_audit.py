@@ -13,10 +13,10 @@ import pytest
 from keypoint_study import comparisons
 from keypoint_study.report import style
 from thesis import (
-    ablations,
     audit,
     audit_of_data,
     audit_of_tables,
+    audit_runs,
     domain_gap,
     run,
 )
@@ -69,7 +69,7 @@ def test_ablations_become_ratios_of_their_reference():
         [f"{number:02d}" for number in range(8)],
         lambda _, method, __: factors[method],
         dict.fromkeys(factors, [None]),
-        estimators=ablations.COMPARED,
+        estimators=audit_runs.COMPARED,
         noise=0.02,
     )
     runs = runs.assign(failed=1.0, sim3=runs["rmse"])

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from keypoint_study.jobs import Job, repeated, runs_of
-from keypoint_study.methods import ABLATIONS, compared_in
+from keypoint_study.methods import ABLATION, of_group
 from keypoint_study.runner import run_all, run_poses
 from keypoint_study.sources import Source
 from thesis_repro import masks
@@ -31,7 +31,8 @@ def run_ablations(
     Columns: sequence, method, estimator, repetition, those of `runner.run_all`, and sim3 (RMSE in
     metres after an alignment with scale).
     """
-    named = [Job(sequence.name, name) for sequence in sequences for name in compared_in(ABLATIONS)]
+    methods = ["baseline", "masked", *of_group(ABLATION)]
+    named = [Job(sequence.name, method) for sequence in sequences for method in methods]
     jobs = [
         job
         for job in repeated(named, COMPARED, repetitions)
