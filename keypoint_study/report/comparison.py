@@ -215,13 +215,6 @@ def table_of_ratios(rows: pd.DataFrame) -> pd.DataFrame:
     return table
 
 
-def ratios_for_paper(table: pd.DataFrame) -> pd.DataFrame:
-    """Return what a paper shows of `comparisons_of`: ratios to all keypoints of both errors."""
-    rows = all_of(table[table["reference"] == "baseline"])
-    columns = ["estimator", "keypoints", *comparisons.JUDGING_METRICS.values(), FAIL]
-    return table_of_ratios(rows).filter(columns)
-
-
 def long_table_of_ratios(table: pd.DataFrame) -> Artefact:
     """Return `comparisons_of` for programs, with a column for each sequence."""
     title, caption = CAPTIONS["ratios"]

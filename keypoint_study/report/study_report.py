@@ -1,6 +1,6 @@
 """The results of a study with the user's masks: findings, figures, tables and a page.
 
-Figures are also written as PDF, across a page and in one column, and tables as LaTeX.
+Figures are also written as PDF, across a page and in one column of a paper.
 """
 
 from collections.abc import Collection, Iterator
@@ -15,7 +15,7 @@ from keypoint_study import comparisons, runner
 from keypoint_study.jobs import ESTIMATOR_TITLES
 from keypoint_study.methods import CONTROL_WIDTH
 from keypoint_study.plan import RUNS, Study
-from keypoint_study.report import comparison, html, latex, style
+from keypoint_study.report import comparison, html, style
 from keypoint_study.report.findings import findings_of
 from keypoint_study.report.paths import figure_of_paths
 from keypoint_study.report.style import COLUMN_WIDTH, PAGE_WIDTH, Artefact
@@ -101,25 +101,15 @@ def write(
         "findings", "What the runs show", "", findings_of(named, table, note, embedded)
     )
     saved = [(findings, style.save(findings, folder, note))]
-    for width in (COLUMN_WIDTH, PAGE_WIDTH):
-        for figure in figures_of(study, runs, table, folder, width):
-            if width == COLUMN_WIDTH:
-                # a tight box would make it wider or narrower than the column
-                style.write_figure(
-                    figure.content, folder / f"{figure.name}-column.pdf", bbox_inches=None
-                )
-                plt.close(figure.content)
-                continue
-            style.write_figure(figure.content, folder / f"{figure.name}.pdf")
-            files = style.save(figure, folder, note)
-            saved.append((figure, [*files, f"{figure.name}.pdf", f"{figure.name}-column.pdf"]))
-    for shown, for_paper in tables_of(named, table):
-        files = style.save(shown, folder, note)
-        if files and for_paper is not None:
-            text = latex.latex_of(shown, for_paper)
-            write_text(folder / f"{shown.name}.tex", f"% {note}\n{text}")
-            files.append(f"{shown.name}.tex")
-        saved.append((shown, files))
+    for figure in figures_of(study, runs, table, folder, COLUMN_WIDTH):
+        # a tight box would make it wider or narrower than the column
+        style.write_figure(figure.content, folder / f"{figure.name}-column.pdf", bbox_inches=None)
+        plt.close(figure.content)
+    for figure in figures_of(study, runs, table, folder, PAGE_WIDTH):
+        style.write_figure(figure.content, folder / f"{figure.name}.pdf")
+        files = style.save(figure, folder, note)
+        saved.append((figure, [*files, f"{figure.name}.pdf", f"{figure.name}-column.pdf"]))
+    saved += [(each, style.save(each, folder, note)) for each in tables_of(named, table)]
     text = html.page_of(
         [html.described(artefact, files) for artefact, files in saved if files],
         study=study,
@@ -158,17 +148,15 @@ def figures_of(
         yield figure_of_sequence(study, runs, sequence, folder, width)
 
 
-def tables_of(
-    runs: pd.DataFrame, table: pd.DataFrame
-) -> Iterator[tuple[Artefact, pd.DataFrame | None]]:
-    """Return the tables of a study, each with what a paper shows of it (None: nothing)."""
-    errors = comparison.table_of_errors(table, runs)
-    yield errors, errors.content
-    widths = comparison.table_of_widths(runs)
-    yield widths, widths.content
-    yield comparison.long_table_of_ratios(table), comparison.ratios_for_paper(table)
+def tables_of(runs: pd.DataFrame, table: pd.DataFrame) -> list[Artefact]:
+    """Return the tables of a study. table: `comparisons_of` the runs."""
     caption = "Settings, errors, failed and flagged frames."
-    yield Artefact("runs", "Every run", caption, runs.round(6), True), None
+    return [
+        comparison.table_of_errors(table, runs),
+        comparison.table_of_widths(runs),
+        comparison.long_table_of_ratios(table),
+        Artefact("runs", "Every run", caption, runs.round(6), for_programs=True),
+    ]
 
 
 def write_paths(study: Study, runs: pd.DataFrame, folder: Path) -> None:

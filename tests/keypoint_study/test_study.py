@@ -116,15 +116,15 @@ def test_figures_and_tables_of_a_study(done, study):
             assert b"/Type3" not in content and b"/FontFile2" in content  # TrueType
             width = float(re.search(rb"/MediaBox \[ 0 0 ([\d.]+)", content)[1])
             assert (width == 3.5 * 72) == (end == "-column.pdf")
-    tables = {"errors.csv", "errors.md", "errors.tex", "widths.tex", "ratios.csv", "ratios.tex"}
-    assert {*tables, "runs.csv"} <= names and not {"ratios.md", "runs.tex"} & names
+    tables = {"errors.csv", "errors.md", "widths.csv", "ratios.csv", "runs.csv"}
+    assert tables <= names and not {"ratios.md", "runs.md"} & names
     ratios = pd.read_csv(folder / "ratios.csv")
     keys = ["source", "label", "reference_source", "reference", "metric", "estimator"]
     assert not ratios.duplicated(keys).any()
     captions = re.findall("<figcaption><p><strong>.*?</strong>(.*?)</p>", page.read_text(), re.S)
     assert len(captions) > 6 and all(len(caption.split()) > 3 for caption in captions)
     links = re.findall('(?:href|src)="([^"#]+)"', page.read_text())
-    assert {"sources.webp", "paths-01.pdf", "errors.tex", "runs.csv"} <= set(links)
+    assert {"sources.webp", "paths-01.pdf", "errors.csv", "runs.csv"} <= set(links)
     assert all((folder / link).is_file() for link in links)
     assert len(report.figure_of_sources(study, runs).content.axes) == 3 * len(study.sources)
     failed = (runs["sequence"] == "01") & (runs["source"] == "net")

@@ -1,24 +1,19 @@
 """Figures and tables of chapter 4, the comparison and the findings show the numbers of the runs."""
 
 import re
-import subprocess
 from html import escape
-from shutil import which
 from types import SimpleNamespace
 
 import made_up
-import matplotlib
 import numpy as np
 import pandas as pd
 import pytest
 from cells import cells
 from matplotlib.container import BarContainer
-from matplotlib.font_manager import FontProperties
-from matplotlib.textpath import TextPath
 
 from keypoint_study import comparisons, ratios, verdicts
 from keypoint_study.jobs import ESTIMATOR_TITLES
-from keypoint_study.report import comparison, findings, html, latex, style, texts
+from keypoint_study.report import comparison, findings, html, style, texts
 from thesis import chapter4, few_keypoints, frames, section_4_2
 from thesis.reported import REPORTED
 from thesis_repro.errors import one_line
@@ -145,44 +140,6 @@ def test_errors_are_means_with_their_spread_and_the_lowest_is_bold():
     assert not single[ELEVEN].map(lambda cell: "±" in cell).any(axis=None)
 
 
-def widths_in(text):
-    """The width of each table in LaTeX, in points, measured in Computer Modern of 8 points."""
-    font = FontProperties(fname=f"{matplotlib.get_data_path()}/fonts/ttf/cmr10.ttf")
-    widths = []
-    for table in re.findall(r"\\toprule\n(.*?)\\bottomrule", text, re.S):
-        plain = re.sub(r"\\(shortstack\[l\]|textbf|midrule\n|\\$)", "", table)
-        plain = re.sub(r"\$.*?\$", "+", plain)
-        rows = [row.split("&") for row in plain.strip().split(" \\\\\n")]
-        width = 85
-        for column in list(zip(*rows, strict=True))[1:]:
-            lines = [line.strip(" {}\\") for cell in column for line in cell.split(" \\\\ ")]
-            paths = [TextPath((0, 0), line, 8, prop=font) for line in lines if line]
-            width += 6 + max(path.get_extents().width for path in paths)
-        widths.append(width)
-    return widths
-
-
-@pytest.mark.parametrize("count", [1, 4, 11])
-def test_tables_for_a_paper_fit_a_column_and_have_caption_and_label(count):
-    runs = runs_of(ELEVEN[:count], halved, noise=0.2, sources=("a_100%{net}", "hand"))
-    runs["se3"] *= 1000
-    table = comparisons.comparisons_of(runs)
-    errors = comparison.table_of_errors(table, runs)
-    widths = comparison.table_of_widths(runs)
-    for artefact, rows in (
-        (errors, errors.content),
-        (widths, widths.content),
-        (comparison.long_table_of_ratios(table), comparison.ratios_for_paper(table)),
-    ):
-        text = latex.latex_of(artefact, rows)
-        measured = widths_in(text)
-        assert measured and max(measured) <= latex.COLUMN
-        for command in ("caption", "label", "end{tabular}", "fontsize{8}"):
-            assert text.count(f"\\{command}") == len(measured)
-        assert "a_100" not in text
-        assert len(set(re.findall(r"\\label{.*?}", text))) == len(measured)
-
-
 def test_the_classes_of_a_narrow_figure_are_named_inside_it():
     every = np.arange(35, dtype=np.uint8)[None]
     frame = np.zeros((40, 120), np.uint8)
@@ -198,36 +155,6 @@ def test_what_cannot_be_told_has_no_column():
     table = comparisons.comparisons_of(runs_of(ELEVEN[:2], halved, noise=0.2))
     few = comparison.table_of_ratios(comparison.all_of(table))
     assert verdicts.TOO_FEW not in few.to_string() and set(few["sequences"]) == {2}
-
-
-DOCUMENT = r"""\documentclass[twocolumn]{article}
-\usepackage[T1]{fontenc}
-\usepackage{booktabs}
-\begin{document}
-\typeout{column \the\columnwidth}
-%s
-\end{document}
-"""
-
-
-@pytest.mark.skipif(not which("pdflatex"), reason="needs LaTeX")
-def test_tables_for_a_paper_are_set_without_an_overfull_box(tmp_path):
-    runs = runs_of(ELEVEN, halved, noise=0.2, sources=("a_100%{net}", "hand"))
-    table = comparisons.comparisons_of(runs)
-    shown = comparison.table_of_errors(table, runs)
-    widths = comparison.table_of_widths(runs)
-    ratios_of = comparison.long_table_of_ratios(table)
-    pairs = (shown, shown.content), (widths, widths.content)
-    pairs += ((ratios_of, comparison.ratios_for_paper(table)),)
-    text = DOCUMENT % "\\clearpage\n".join(latex.latex_of(*pair) for pair in pairs)
-    (tmp_path / "paper.tex").write_text(text)
-    command = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "paper.tex"]
-    told = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, errors="replace")
-    assert told.returncode == 0, told.stdout[-2000:]
-    assert float(re.search(r"column ([\d.]+)pt", told.stdout)[1]) == pytest.approx(
-        latex.COLUMN, 0.01
-    )
-    assert re.findall(r"Overfull .*", (tmp_path / "paper.log").read_text(errors="replace")) == []
 
 
 def test_ratios_in_the_tables_equal_the_comparison():
