@@ -21,7 +21,6 @@ from keypoint_study import methods, ratios, verdicts
 from keypoint_study.jobs import CONTROL_WIDTH, ESTIMATOR_TITLES
 from keypoint_study.methods import MASK_CONTROLS, METHODS
 from keypoint_study.path_errors import ERRORS
-from keypoint_study.sources import UNMASKED
 from keypoint_study.verdicts import verdict
 
 # {name: title} of the methods and errors that are compared. The judging metrics decide.
@@ -31,7 +30,7 @@ METHOD_TITLES = {
     if method.group in (methods.BROUGHT, methods.LABEL_MAPS, methods.CONTROL)
 }
 SEGMENTATION_FREE_CONTROLS = methods.of_group(methods.CONTROL)
-BROUGHT = ("masked", *UNMASKED)  # methods of what a user brings; the others are controls
+BROUGHT = ("masked", "keypoints")  # methods of what a user brings; the others are controls
 METRIC_TITLES = {name: error.title for name, error in ERRORS.items()}
 JUDGING_METRICS = {name: error.title for name, error in ERRORS.items() if error.decides}
 
@@ -204,15 +203,15 @@ def judging_estimator(runs: pd.DataFrame) -> str:
 def labels(runs: pd.DataFrame) -> pd.Series:
     """Label each run with its method and the width of its masks.
 
-    If there are several sources, the label begins with the run's source. Own keypoints and paths
-    are labelled with the name of their source.
+    If there are several sources, the label begins with the run's source. Own keypoints are labelled
+    with the name of their source.
     """
     width = runs["dilation_width"].where(runs["method"] == "masked")
     width = width.map(", width {:g}".format, na_action="ignore").astype(object).fillna("")
     label = runs["method"].map(METHOD_TITLES) + width
     if len(sources(runs)) > 1:
         label = (runs["source"] + ": " + label).str.removeprefix(": ")  # all keypoints have none
-    return label.mask(runs["method"].isin(UNMASKED), runs["source"])
+    return label.mask(runs["method"] == "keypoints", runs["source"])
 
 
 # Parts of a table of runs

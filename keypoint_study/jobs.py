@@ -22,7 +22,7 @@ from keypoint_study.methods import (
     Asked,
     changed,
 )
-from keypoint_study.sources import UNMASKED, Source
+from keypoint_study.sources import Source
 from thesis_repro.data.kitti import TRUE_LABELS
 from thesis_repro.data.sequence import Sequence
 from thesis_repro.errors import InputError
@@ -86,7 +86,7 @@ class Job:
 
 
 class Run(NamedTuple):
-    """A run. masks: `odometry.Masks`. brought: in place of the odometry or of parts of it."""
+    """A run. masks: `odometry.Masks`. brought: own keypoints."""
 
     sequence: Sequence
     settings: OdometrySettings
@@ -117,9 +117,8 @@ def runs_of(
         method: str, sequence: str, source: str, width: int | None, number: int | None
     ) -> Run | str:
         given, frames = sources_by_name.get(source, default), opened[sequence]
-        if method in UNMASKED:
-            brought = replace(given, folder=given.file(sequence))
-            return Run(frames, THESIS, brought=brought)
+        if method == "keypoints":
+            return Run(frames, THESIS, brought=given)
         asked = Asked(frames, given, CONTROL_WIDTH if width is None else width, number or 0)
         try:
             own, masks = METHODS[method].choose(asked)
@@ -155,7 +154,7 @@ def first_jobs(
     widths: pixels, for masks from label maps, by estimator: {"thesis": range(1, 16)}.
     tested: width (pixels) of the controls, None for no controls; it is added to the widths of every
     estimator.
-    sources: of masks, keypoints or paths. All keypoints are run once for all sources.
+    sources: of masks or keypoints. All keypoints are run once for all sources.
     """
     all_widths = set(chain(*widths.values()))
     if tested:
@@ -164,7 +163,7 @@ def first_jobs(
     for sequence in sequences:
         jobs.append(Job(sequence.name, "baseline"))
         for source in sources:
-            if source.kind in UNMASKED:
+            if source.kind == "keypoints":
                 jobs.append(Job(sequence.name, source.kind, source=source.name))
                 continue
             masks = Job(sequence.name, "masked", source=source.name)
@@ -178,9 +177,7 @@ def first_jobs(
     return [
         job
         for job in repeated(jobs, widths, repetitions)
-        # a path has nothing to shuffle
-        if (job.method != "paths" or job.repetition == 0)
-        and (job.method != "masked" or job.dilation_width in (None, tested, *widths[job.estimator]))
+        if job.method != "masked" or job.dilation_width in (None, tested, *widths[job.estimator])
     ]
 
 

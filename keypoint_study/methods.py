@@ -174,9 +174,8 @@ FEW, ABLATION, CHAPTER_4 = "few keypoints", "ablation", "chapter 4"
 METHODS = {  # in the order in which they are shown
     "baseline": Method("all keypoints", BROUGHT, all_keypoints),
     "masked": Method("masks", BROUGHT, masked),
-    # these two as sources.KINDS has them
+    # as sources.KINDS has it
     "keypoints": Method("own keypoints", BROUGHT, all_keypoints),
-    "paths": Method("path of another system", BROUGHT, all_keypoints),
     "exact-boundaries": Method(
         "exact class boundaries", LABEL_MAPS, with_masks(boundaries="exact", keep="boundaries")
     ),

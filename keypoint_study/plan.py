@@ -1,9 +1,7 @@
 """A study with your own masks: its settings, the check of its input, and its runs."""
 
-from collections.abc import Container
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +19,7 @@ RUNS = "runs"  # folder of the results of the runs
 
 @dataclass(frozen=True)
 class Study:
-    """One or several sources of masks, own keypoints or paths, compared with all keypoints.
+    """One or several sources of masks or own keypoints, compared with all keypoints.
 
     sequences: their names. widths: pixels, for masks from label maps. tested: width of the
     controls, None for no controls. estimators: their names. frames: number of frames of each
@@ -125,7 +123,6 @@ class Study:
         warnings = [
             *outcome.warnings,
             *foreign.values(),
-            *self._foreign_paths(foreign),
             *runner.number_warnings(table, self.sources),
         ]
         return replace(outcome, table=table, warnings=warnings)
@@ -152,18 +149,6 @@ class Study:
         lines = {name: f"{line}; sequence {name} is left out" for name, line in lines.items()}
         for line in lines.values():
             program.log.warning(line)
-        return lines
-
-    def _foreign_paths(self, left_out: Container[str]) -> list[str]:
-        """Return a line for each path of another convention than the camera's, and print it."""
-        lines = []
-        for source, sequence in product(self.sources, self.opened):
-            if source.kind == "paths" and sequence.name not in left_out:
-                file = source.file(sequence.name)
-                poses = sources.read_path(file, sequence)
-                if reason := metrics.foreign_poses(poses, sequence.poses):
-                    lines.append(f"{file}: {reason}")
-                    program.log.warning(lines[-1])
         return lines
 
     @property

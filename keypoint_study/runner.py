@@ -288,7 +288,7 @@ def _paths(runs: Mapping[Job, Run]) -> dict[Job, pd.DataFrame | str]:
         made |= odometry.run_many(sequence, asked, failed=failed)
     for job, result in made.items():
         # without keypoints, the path is a point, whatever the method
-        if job.method != "paths" and result.frames["detected"].isna().all():
+        if result.frames["detected"].isna().all():
             failed[job] = (
                 f"sequence {job.sequence}: no frame has any structure (all are black, white or of one "
                 "gray); check how they were written"

@@ -1,4 +1,4 @@
-"""What a user brings to a study: masks, keypoints or the paths of another system."""
+"""What a user brings to a study: masks or keypoints."""
 
 import re
 import runpy
@@ -10,37 +10,27 @@ from traceback import walk_tb
 from typing import Any, TypeAlias
 
 import numpy as np
-import pandas as pd
 
 from thesis_repro import odometry
 from thesis_repro.data import label_ids
 from thesis_repro.data.label_ids import LABEL_IDS
 from thesis_repro.data.sequence import Sequence
-from thesis_repro.data.trajectories import read_truth
 from thesis_repro.errors import InputError, cause
 from thesis_repro.masks import MaskSettings
 from thesis_repro.masks.folders import LabelMasks, MaskFolder, folder_of_sequence, read_mask
 from thesis_repro.odometry import inputs
-from thesis_repro.running.files import images
 
-KINDS = {
-    "labels": "label maps",
-    "masks": "masks",
-    "keypoints": "own keypoints",
-    "paths": "paths of another system",
-}
-UNMASKED = ("keypoints", "paths")  # kinds without masks; their methods have the same names
+KINDS = {"labels": "label maps", "masks": "masks", "keypoints": "own keypoints"}
 FileMasks: TypeAlias = LabelMasks | MaskFolder  # both have `paths`, the files that they read
 
 
 @dataclass(frozen=True)
 class Source:
-    """A source of masks, or of runs without masks.
+    """A source of masks, or of own keypoints.
 
     folder: holds one folder for each sequence or, for a single sequence, the files themselves.
     kind: "labels" for label maps of any size, whose boundaries are dilated; "masks" for masks of
-    the frames' size; "keypoints" for a Python file (`own_calls`) in place of the folder; "paths"
-    for a folder with a file of poses for each sequence.
+    the frames' size; "keypoints" for a Python file (`own_calls`) in place of the folder.
     name: used in the names of its runs; empty if there is only one source.
     settings: how masks are made from label maps. invert: swap kept and ignored pixels of ready-made
     masks. ids: what label maps hold, see `LabelMasks`.
@@ -73,39 +63,24 @@ class Source:
         width = dilation_width if self.has_width else None
         return LabelMasks(self.folder, sequence, width, self.settings, self.ids)
 
-    def file(self, sequence: str) -> Path:
-        """Return the file of the keypoints, or of the path of a sequence."""
-        if self.kind == "keypoints" or self.folder.is_file():
-            return self.folder
-        return self.folder / f"{sequence}.txt"
-
-    def read(self, sequence: Sequence) -> odometry.Calls | np.ndarray:
-        """Return the `own_calls` of keypoints, or the `own_path` of a sequence."""
-        if self.kind == "keypoints":
-            return own_calls(self.folder)
-        return own_path(self.file(sequence.name), sequence)
-
     def run(self, sequence: Sequence, settings: odometry.OdometrySettings) -> odometry.Result:
-        """Return the run with own keypoints, or a path as if it were a run."""
-        brought = self.read(sequence)
-        if isinstance(brought, odometry.Calls):
-            own_search = brought.find_essential_matrix is not odometry.OPENCV.find_essential_matrix
-            if own_search and hasattr(settings.estimator, "search"):
-                raise InputError(
-                    f"{self.folder}: find_essential_matrix would not be used, because this estimator has a "
-                    "search of its own; choose another --estimator"
-                )
-            return odometry.run(sequence, settings, calls=brought)
-        steps = [odometry.Step(index, pose=pose) for index, pose in enumerate(brought)]
-        return odometry.Result(brought, pd.DataFrame([step.row() for step in steps]))
+        """Return the run with own keypoints."""
+        calls = own_calls(self.folder)
+        own_search = calls.find_essential_matrix is not odometry.OPENCV.find_essential_matrix
+        if own_search and hasattr(settings.estimator, "search"):
+            raise InputError(
+                f"{self.folder}: find_essential_matrix would not be used, because this estimator has a "
+                "search of its own; choose another --estimator"
+            )
+        return odometry.run(sequence, settings, calls=calls)
 
     @property
     def paths(self) -> list[Path]:
-        """The file of keypoints or of a path, on which the runs depend."""
+        """The file of keypoints, on which the runs depend."""
         return [self.folder]
 
     def record(self) -> list[str]:
-        """Return what the runs of keypoints or paths depend on beside files."""
+        """Return what the runs of keypoints depend on beside files."""
         return [self.kind]
 
 
@@ -203,31 +178,6 @@ def _try(path: Path, sequence: Sequence) -> None:
         raise InputError(f"{path}: {cause(error)}") from error
 
 
-def own_path(path: Path, sequence: Sequence) -> np.ndarray:
-    """Return the path of another system, (n, 4, 4), metres, moved to where the odometry starts.
-
-    See `read_path`.
-    """
-    poses = read_path(path, sequence)
-    return odometry.start_pose(sequence) @ np.linalg.inv(poses[0]) @ poses
-
-
-def read_path(path: Path, sequence: Sequence) -> np.ndarray:
-    """Return the poses of a file at the frames of a sequence, (n, 4, 4).
-
-    The file has poses with times, or one for each frame: of the sequence or, because it may be only
-    a part of them, of its folder. Raises InputError if a frame has no pose.
-    """
-    _, poses = read_truth(path, sequence.times if sequence.has_times else None)
-    frames = images(sequence.frame_paths[0].parent)
-    if len(poses) == len(frames):
-        place = {frame: index for index, frame in enumerate(frames)}
-        poses = poses[[place[frame] for frame in sequence.frame_paths]]
-    if len(poses) != len(sequence):
-        raise InputError(f"{path}: {len(poses)} poses for {len(sequence)} frames; each needs one")
-    return poses
-
-
 def named(
     folders: Iterable[tuple[str, str | None, Path]],
     settings: MaskSettings,
@@ -275,11 +225,8 @@ def check(
     """
     for source in sources:
         kind = KINDS[source.kind]
-        if source.kind in UNMASKED:
-            for sequence in sequences:
-                source.read(sequence)
-            if source.kind == "keypoints":
-                _try(source.folder, next(iter(sequences)))
+        if source.kind == "keypoints":
+            _try(source.folder, next(iter(sequences)))
             continue
         if not source.folder.is_dir():
             raise InputError(

@@ -209,8 +209,7 @@ def table_of_ratios(rows: pd.DataFrame) -> pd.DataFrame:
         )
     table = pd.DataFrame(lines)
     if lines:
-        # missing for paths of another system
-        table["number"] = table["number"].round().astype("Int64")
+        table["number"] = table["number"].round().astype(int)
         table = texts.without_untold(table, "verdict", "failures")
     return table
 

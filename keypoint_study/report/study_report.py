@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 
 from keypoint_study import comparisons, runner
+from keypoint_study.comparisons import BROUGHT
 from keypoint_study.jobs import ESTIMATOR_TITLES
 from keypoint_study.methods import CONTROL_WIDTH
 from keypoint_study.plan import RUNS, Study
@@ -19,7 +20,7 @@ from keypoint_study.report import comparison, html, style
 from keypoint_study.report.findings import findings_of
 from keypoint_study.report.paths import figure_of_paths
 from keypoint_study.report.style import COLUMN_WIDTH, PAGE_WIDTH, Artefact
-from keypoint_study.sources import KINDS, UNMASKED, FileMasks, Source, own_calls
+from keypoint_study.sources import KINDS, FileMasks, Source, own_calls
 from thesis_repro import checks
 from thesis_repro.data.label_ids import LABEL_IDS
 from thesis_repro.data.sequence import Sequence
@@ -34,7 +35,6 @@ from thesis_repro.running import program, provenance
 from thesis_repro.running.files import write_text
 
 PATHS = "paths"  # folder of the estimated paths
-DRAWN = ("masked", "keypoints")  # methods of what a user brings that acts on frames
 
 
 def make(
@@ -64,7 +64,7 @@ def make(
 def _doubts(study: Study, runs: pd.DataFrame) -> Iterator[str]:
     """Yield warnings of the runs, one of each sequence and source at the shown width."""
     shown = runs["dilation_width"].isna() | (runs["dilation_width"] == study.shown_width)
-    of_shown = runs[shown & runs["method"].isin(("baseline", *DRAWN))]
+    of_shown = runs[shown & runs["method"].isin(("baseline", *BROUGHT))]
     standing = {sequence.name: checks.standing(sequence) for sequence in study.opened}
     for run in of_shown.drop_duplicates(["sequence", "source"]).itertuples():
         yield from checks.run_warnings(
@@ -142,7 +142,7 @@ def figures_of(
     for source in ["", *(controlled["source"].unique() if len(masked) > 1 else [])]:
         if not comparison.judged(table, source).empty:
             yield comparison.figure_of_ratios(table, source, width)
-    if runs["method"].isin(DRAWN).any():
+    if runs["method"].isin(BROUGHT).any():
         yield figure_of_sources(study, runs, width)
     for sequence in study.opened:
         yield figure_of_sequence(study, runs, sequence, folder, width)
@@ -177,7 +177,7 @@ def write_paths(study: Study, runs: pd.DataFrame, folder: Path) -> None:
 
 def shown_masks(study: Study) -> list[tuple[Sequence, list[FileMasks]]]:
     """Return each sequence with the masks of each source, at the `shown_width`."""
-    sources = [source for source in study.sources if source.kind not in UNMASKED]
+    sources = [source for source in study.sources if source.kind != "keypoints"]
     return [
         (sequence, [source.masks(sequence, study.shown_width) for source in sources])
         for sequence in study.opened
@@ -192,7 +192,7 @@ def figure_of_sources(study: Study, runs: pd.DataFrame, width: float = PAGE_WIDT
     paper, sources stand side by side. Own keypoints have no mask. Sources whose runs failed are
     left out. width: inches.
     """
-    drawn = runs[runs["method"].isin(DRAWN)]
+    drawn = runs[runs["method"].isin(BROUGHT)]
     name = drawn["sequence"].iloc[0]
     with_runs = set(drawn.loc[drawn["sequence"] == name, "source"])
     sources = [source for source in study.sources if source.name in with_runs]
@@ -254,7 +254,7 @@ def figure_of_sequence(
         (runs["sequence"] == sequence.name)
         & (runs["repetition"] == 0)
         & (runs["estimator"] == comparisons.judging_estimator(runs))
-        & runs["method"].isin(["baseline", "masked", *UNMASKED])
+        & runs["method"].isin(["baseline", *BROUGHT])
         & (widths.isna() | (widths == study.shown_width))
     ]
     shown = {}

@@ -78,15 +78,15 @@ def of_tables(kitti, folder, capsys):
     """What programs read: the columns of tables and the keys of JSON."""
     sequence = tr.Sequence(kitti, "00")
     assert cli.main(["odometry", "--kitti", str(kitti), "--sequence", "00", "--json"]) == 0
-    path, source = jobs.Job("00", "paths", source="mine"), Source(kitti / "poses", "paths", "mine")
-    runs = runner.run_all(jobs.runs_of([path], [sequence], [source]), folder).table
+    job = jobs.Job("00", "baseline")
+    runs = runner.run_all(jobs.runs_of([job], [sequence], [Source(kitti)]), folder).table
     in_git = pd.read_csv(RUNS, dtype={"sequence": str}).fillna({"source": ""})
     compared = comparisons.comparisons_of(in_git)
     ratios = comparison.long_table_of_ratios(compared).content
     return {
         "odometry --json": {*json.loads(capsys.readouterr().out)},
         "runs.csv": {*runs},
-        "runs/SEQUENCE/RUN.csv": {*pd.read_csv(folder / "00" / f"{path.name}.csv")},
+        "runs/SEQUENCE/RUN.csv": {*pd.read_csv(folder / "00" / f"{job.name}.csv")},
         "ratios.csv": {*ratios} - {*in_git["sequence"]},
     }
 

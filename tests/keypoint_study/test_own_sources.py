@@ -15,13 +15,12 @@ from keypoint_study.sources import Source
 from thesis_repro import odometry
 from thesis_repro.command.cli import main
 from thesis_repro.data.sequence import Sequence
-from thesis_repro.data.trajectories import write_kitti_poses, write_tum
+from thesis_repro.data.trajectories import write_kitti_poses
 from thesis_repro.errors import InputError
 from thesis_repro.odometry import metrics
 from thesis_repro.odometry.loop import VoteOfAll
 
 pytestmark = pytest.mark.slow
-T = np.arange(12) / 10  # times of the frames
 
 
 @pytest.fixture
@@ -193,30 +192,6 @@ def test_own_keypoints_have_controls_of_equal_number_and_their_flags_are_told(st
     number = runs.groupby("method")["mean_keypoints"].mean()
     assert set(runs.index) == {"baseline", "keypoints", "fewer", "spread"}
     assert number["fewer"] == pytest.approx(number["keypoints"], abs=1)
-
-
-@pytest.mark.parametrize("form", [write_kitti_poses, lambda path, poses: write_tum(path, poses, T)])
-def test_a_path_is_taken_at_the_frames_that_have_a_truth(street, tmp_path, form):
-    poses = Street(12).poses
-    write_tum(street / "poses/00.txt", poses[5:], T[5:])  # the truth begins late
-    (street / "sequences/00/times.txt").write_text("".join(f"{time}\n" for time in T))
-    form(tmp_path / "path.txt", poses)
-    sequence = Sequence(street, "00")
-    for part in (sequence, sequence.subset(4)):
-        assert np.allclose(sources.own_path(tmp_path / "path.txt", part), part.poses, atol=1e-8)
-
-
-def test_a_path_with_other_axes_is_told(street, capsys):
-    flip = np.diag([1.0, -1, -1, 1])
-    poses = Street(12).poses
-    for name, path in (("opengl", flip @ poses @ flip), ("right", poses)):
-        for sequence in ("00", "01"):
-            write_kitti_poses(street.parent / name / f"{sequence}.txt", path)
-    paths = [word for name in ("opengl", "right") for word in ("--paths", street.parent / name)]
-    code, out = study(street, *paths)
-    error = capsys.readouterr().err
-    assert code == 0 and error.count("opengl/0") == 2 and "OpenGL" in error
-    assert "right/0" not in error and "OpenGL" in (out / "index.html").read_text()
 
 
 BREAKING = """

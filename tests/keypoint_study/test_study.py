@@ -194,60 +194,40 @@ def test_each_folder_of_label_maps_may_name_its_ids(
 
 
 @pytest.fixture
-def brought(study, done, tmp_path):
-    """A study of own keypoints, which are all keypoints, and of the paths with all keypoints."""
+def brought(study, tmp_path):
+    """A study of own keypoints, which are all keypoints."""
     (tmp_path / "mine.py").write_text("from thesis_repro.odometry.loop import detect\n")
-    (tmp_path / "slam").mkdir()
-    for name, form in (("00", "kitti"), ("01", "tum")):
-        written = done[0] / "paths" / form / name / "baseline-0.txt"
-        shutil.copy(written, tmp_path / "slam" / f"{name}.txt")
-    sources = (
-        Source(tmp_path / "mine.py", "keypoints", "mine"),
-        Source(tmp_path / "slam", "paths", "slam"),
-    )
+    sources = (Source(tmp_path / "mine.py", "keypoints", "mine"),)
     return replace(study, sources=sources, widths=(), tested=None)
 
 
-def test_own_keypoints_and_paths_are_rows_as_masks_are(brought, tmp_path):
+def test_own_keypoints_are_rows_as_masks_are(brought, tmp_path):
     brought.check()
     runs = brought.run(tmp_path / "out").table
     keys = ["sequence", "repetition"]
-    of_all, mine, slam = (
-        runs[runs["source"] == name].set_index(keys) for name in ("", "mine", "slam")
-    )
+    of_all, mine = (runs[runs["source"] == name].set_index(keys) for name in ("", "mine"))
     numbers = ["rmse", "se3", "rotation", "mean_keypoints"]
     assert mine[numbers].equals(of_all[numbers]) and len(mine) == 4
-    expected = of_all.loc[slam.index, numbers[:3]]
-    assert np.allclose(slam[numbers[:3]], expected, atol=1e-8) and len(slam) == 2
     report.write(brought, runs, tmp_path / "out")
     ratios = pd.read_csv(tmp_path / "out" / "ratios.csv").query("method != 'baseline'")
-    assert list(ratios["label"].unique()) == ["mine", "slam"]
-    assert ratios.groupby("label")["keypoints"].count()["slam"] == 0
+    assert list(ratios["label"].unique()) == ["mine"]
     errors = pd.read_csv(tmp_path / "out" / "errors.csv")
-    assert list(errors["method"]) == ["all keypoints", "mine", "slam"] * 2
+    assert list(errors["method"]) == ["all keypoints", "mine"] * 2
     times = files(tmp_path / "out")
-    path = tmp_path / "slam" / "00.txt"
-    path.write_text(path.read_text() + "1 0 0 0 0 1 0 0 0 0 1 9\n" * 8)  # twelve, as frames are
+    path = tmp_path / "mine.py"
+    path.write_text(path.read_text() + "# edited\n")
     again = brought.run(tmp_path / "out")
     changed = {path for path, time in times.items() if path.stat().st_mtime_ns != time}
-    assert (again.made, again.kept) == (1, len(runs) - 1) and len(changed) == 1
+    assert (again.made, again.kept) == (4, len(runs) - 4) and len(changed) == 4
     assert again.table["se3"].equals(runs["se3"])
 
 
-@pytest.mark.parametrize(
-    "name, text, named",
-    [
-        ("mine.py", "detector = 5", "mine.py: must define"),
-        ("slam/00.txt", "1 0 0 0 0 1 0 0 0 0 1 0\n" * 3, "00.txt: 3 poses for 4 frames"),
-        ("slam/00.txt", "1 0 0 0 0 1 0 0 0 0 1\n" * 4, "00.txt, line 1: "),
-    ],
-)
-def test_what_is_no_path_and_no_keypoints_is_named(brought, tmp_path, name, text, named):
-    (tmp_path / name).write_text(text)
-    with pytest.raises(InputError, match=named):
+def test_what_is_no_keypoints_is_named(brought, tmp_path):
+    (tmp_path / "mine.py").write_text("detector = 5")
+    with pytest.raises(InputError, match="mine.py: must define"):
         brought.check()
-    (tmp_path / name).unlink()
-    with pytest.raises((InputError, OSError), match=name):
+    (tmp_path / "mine.py").unlink()
+    with pytest.raises((InputError, OSError), match="mine.py"):
         brought.check()
 
 
@@ -264,9 +244,8 @@ def test_results_of_another_length_are_kept(done, study):
         ("", "--labels"),
         ("--labels nowhere", "nowhere: "),
         ("--labels nowhere:train", "nowhere: "),
-        ("--paths nowhere", "nowhere/00.txt: "),
         ("--keypoints none.py", "none.py"),
-        ("--paths a=nowhere --labels a={labels}", "'a'"),
+        ("--masks a=nowhere --labels a={labels}", "'a'"),
         ("--labels {labels}:none.csv", "none.csv: "),
         ("--labels {labels} --labels {labels}", "small_labels"),
         ("--labels a={labels} --masks A={masks}", "'A'"),

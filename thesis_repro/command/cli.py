@@ -149,7 +149,7 @@ def odometry(options: Any) -> None:
 
 
 def study(options: Any) -> int:
-    """Compare your own masks, keypoints or paths with all keypoints and with controls."""
+    """Compare your own masks or keypoints with all keypoints and with controls."""
     from keypoint_study import sources
     from keypoint_study.plan import Study
     from thesis_repro.data import kitti, layout
@@ -157,8 +157,8 @@ def study(options: Any) -> int:
 
     if not options.sources:
         raise InputError(
-            "nothing to compare: name a folder of label maps with --labels or of masks with --masks, own "
-            "--keypoints, or --paths"
+            "nothing to compare: name a folder of label maps with --labels or of masks with --masks, or own "
+            "--keypoints"
         )
     kinds = {kind for kind, _, _ in options.sources}
     has_labels = "labels" in kinds

@@ -350,11 +350,6 @@ COMMANDS: dict[str, dict[str, Any]] = {
             "Python file, which is executed, with your function detect(frame, settings, mask), "
             "track(previous, current, points, settings), or others of the odometry's four calls",
         ),
-        "--paths": _source(
-            "paths",
-            "[NAME=]DIR",
-            "folder with the path NN.txt of another system for each sequence, in KITTI's or TUM's format, metres",
-        ),
         "--widths": dict(
             type=values.list_of_widths,
             nargs="+",

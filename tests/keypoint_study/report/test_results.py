@@ -131,10 +131,10 @@ def test_errors_are_means_with_their_spread_and_the_lowest_is_bold():
     bold = table[ELEVEN].map(lambda cell: cell.startswith("**"))
     of_masks = bold[table["method"] == "masks, width 10"]
     assert (bold.sum() == 4).all() and of_masks.to_numpy().mean() > 0.9
-    paths = runs[runs["method"] == "baseline"].assign(method="paths", source="slam")
-    beside = pd.concat([runs_of(ELEVEN, halved, noise=0.2, sources=("net",)), paths])
+    own = runs[runs["method"] == "baseline"].assign(method="keypoints", source="mine")
+    beside = pd.concat([runs_of(ELEVEN, halved, noise=0.2, sources=("net",)), own])
     shown = comparison.table_of_errors(comparisons.comparisons_of(beside), beside).content
-    assert len(shown) == len(table) + 4 and "slam" in set(shown["method"])
+    assert len(shown) == len(table) + 4 and "mine" in set(shown["method"])
     once = runs[runs["repetition"] == 0]
     single = comparison.table_of_errors(comparisons.comparisons_of(once), once).content
     assert not single[ELEVEN].map(lambda cell: "±" in cell).any(axis=None)
