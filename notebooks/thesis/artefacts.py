@@ -18,7 +18,6 @@ from thesis_repro.data import kitti
 from thesis_repro.errors import InputError
 from thesis_repro.running import files, program, provenance
 
-LABELS_BY = "labels_by.txt"  # in the folder of the run, for people: who made the label maps
 IN_PACKAGE = "the model in the package"
 NETWORK_IN_PACKAGE = "11a5270f8fd2"  # its digest in records of label maps, without TensorFlow
 

@@ -22,7 +22,7 @@ from cells import NOTEBOOKS, cells, named
 from scipy import stats
 
 import thesis_repro as tr
-from keypoint_study import comparisons, ratios
+from keypoint_study import comparisons
 from thesis import artefacts, audit_of_tables, earlier, section_4_2
 from thesis.settings import PREFIX, ROOT, read_settings
 from thesis_repro import masks
@@ -33,9 +33,9 @@ from thesis_repro.running import provenance
 # the cells that an edit goes through, without those that only show something
 READING = "02 28 03 09 30 31 36 11 32 13 15"
 TRANSFORMS = "02 20 03 04 06 22 23"
+DOUBLED = f"{TRANSFORMS} 32 08 24 29 17 34"
 NETWORK = "01 02 32 03 15 17 39 19 34"
-LOSS = "01 02 27 03 05 06 08 43 45 60 62"
-LOSSES = f"{LOSS} 39 47 40 41"
+LOSSES = "01 02 27 03 05 06 08 43 45 60 62 39 47 40 41"
 FIRST = "01 02 03 05 06 52"  # of notebook 6
 MASKS = f"{FIRST} 08 09 12 13 46 47 48"
 PREDICTION = "01 02 03 04 06 07 41 14 15 23"
@@ -43,9 +43,6 @@ LOOP = "01 02 03 04 06 15 18 23 24 39 40 43 44 52 60 80"
 CHOICES = "01 02 03 04 23 52 43 54 55"
 TEXT = "aligned ATE (m)"
 CROSS_ENTROPY = "other_loss = keras.losses.CategoricalCrossentropy()"
-ALL_SEQUENCES = "kitti.sequences(settings.kitti)"
-WINDOW_OF_5 = "WINDOW = 21 ", "WINDOW = 5 "
-SKY = "classes=(),", 'classes=("sky",),'
 ROTATION = "rotation error (°/frame)"
 
 
@@ -68,11 +65,6 @@ def parameters(names):
     return names["model"].count_params()
 
 
-def fall_of_loss(names):
-    losses = names["history1"].history["loss"]
-    return losses[0] - losses[-1]
-
-
 # exercise: (cells, an old and a new text, what is looked at, what holds of it before and after)
 BEFORE_AND_AFTER = {
     "01_1": (
@@ -80,12 +72,6 @@ BEFORE_AND_AFTER = {
         ("LABEL_RESIZING = cv2.INTER_NEAREST", "LABEL_RESIZING = cv2.INTER_LINEAR"),
         lambda names: set(np.unique(names["labels"])),
         operator.lt,
-    ),
-    "01_3": (  # what Figure 3.5 counts stays
-        READING,
-        ("VALIDATION_SHARE = 0.2", "VALIDATION_SHARE = 0.5"),
-        lambda names: (len(names["validation_images"]), names["labels"].tolist()),
-        lambda usual, edited: usual[0] < edited[0] and usual[1] == edited[1],
     ),
     "02_1": (
         TRANSFORMS,
@@ -107,12 +93,6 @@ BEFORE_AND_AFTER = {
         parameters,
         lambda usual, edited: edited == pytest.approx(2 * usual, rel=0.1),
     ),
-    "04_3": (
-        LOSS,
-        ("LEARNING_RATE = settings.sizes.learning_rate", "LEARNING_RATE = 0.00001"),
-        fall_of_loss,
-        lambda usual, edited: 0 < edited < usual / 4,
-    ),
 }
 # exercise: (an old and a new text, what masks.json holds beside the width of 10, what holds of the
 # reader's row of the last table of notebook 6 as a ratio to the thesis's)
@@ -123,21 +103,16 @@ YOUR_MASKS = {
         lambda row: row["coverage (%)"] > 1.05 and row["keypoints"] > 1,
     ),
     "06_2": (
-        SKY,
-        {"classes": ["sky"]},
-        lambda row: row["keypoints"] < 0.25 and row[ROTATION] > 1,
-    ),
-    "06_3": (
         ("WIDTH = 10 ", "WIDTH = 3 "),
         {"width": 3},
         lambda row: row["coverage (%)"] < row["keypoints"] < 1,
     ),
-    "06_3, inverse": (
+    "06_2, inverse": (
         ('keep="boundaries"', 'keep="inverse"'),
         {"keep": "inverse"},
         lambda row: row["keypoints"] > 1,
     ),
-    "06_4": (
+    "06_2, by hand": (
         ("dilate(edge_image, kernel)", "dilate(edge_image, kernel, None, None, 2)"),
         {},
         lambda row: row["coverage (%)"] > 1.2,
@@ -145,13 +120,12 @@ YOUR_MASKS = {
 }
 # the same of notebook 7, and whether its cell prints EDITED
 YOUR_LOOP = {
-    "07_2": (WINDOW_OF_5, False, lambda row: row["tracked (%)"] < 0.95),
-    "07_4": (
+    "07_2": (
         ('"maxLevel": 3', '"maxLevel": 0'),
         True,
         lambda row: row["tracked (%)"] > 1 and row[ROTATION] > 5,
     ),
-    "07_4, the position": (
+    "07_2, the position": (
         ("position + scales[number]", "position + 2 * scales[number]"),
         True,
         lambda row: row[TEXT] > 10,
@@ -181,18 +155,12 @@ def build(small_world, small_labels, choose):
 
 
 @pytest.fixture
-def images(build):
-    """The same, with the arrays of notebook 1."""
-    run("01", f"{READING} 25")
+def lessons(executed, build):
+    """The same, with what the executed notebooks 1 to 3 left."""
+    left = executed / "build/embedded-smoke"
+    shutil.copytree(left / "data", build / "data")
+    shutil.copy(left / "network.keras", build)
     return build
-
-
-@pytest.fixture
-def networks(images):
-    """The same, with the arrays of notebook 2 and the network of notebook 3."""
-    run("02", f"{TRANSFORMS} 32 08 24 29 17 34")
-    run("03", f"{NETWORK} 27")
-    return images
 
 
 def test_every_exercise_has_a_test():
@@ -208,11 +176,10 @@ def test_every_exercise_has_a_test():
 
 
 @pytest.mark.parametrize("exercise", BEFORE_AND_AFTER)
-def test_an_edit_has_the_promised_effect(exercise, request):
-    number = exercise[:2]
-    request.getfixturevalue({"02": "images", "04": "networks"}.get(number, "build"))
+@pytest.mark.notebooks
+def test_an_edit_has_the_promised_effect(exercise, lessons):
     ids, edit, look, holds = BEFORE_AND_AFTER[exercise]
-    usual, edited = look(run(number, ids)), look(run(number, ids, edit))
+    usual, edited = (look(run(exercise[:2], ids, *edits)) for edits in ((), [edit]))
     assert holds(usual, edited)
 
 
@@ -231,30 +198,20 @@ def test_exercise_01_2(build):
         training.check_images(names["train_images"], (None, 64, 64, 1))
 
 
-def test_exercise_02_2(images):
+@pytest.mark.notebooks
+def test_exercise_02_2(lessons):
     written = []
     full = "FULL_VALIDATION_AUGMENTATION = False", "FULL_VALIDATION_AUGMENTATION = True"
     for edit in ((), [full]):
-        run("02", f"{TRANSFORMS} 32 08 24 29 17 34", *edit)
-        files = sorted((images / "data").glob("doubled_*"))
+        run("02", DOUBLED, *edit)
+        files = sorted((lessons / "data").glob("doubled_*"))
         written.append({file.stem: file.read_bytes() for file in files})
     same = {name for name in written[0] if written[0][name] == written[1][name]}
     assert same == {"doubled_train_images", "doubled_train_labels"}
 
 
-def test_exercise_02_3(images):
-    edit = "SEEDS_COMPARED = 20 ", "SEEDS_COMPARED = 200 "
-    printed = run("02", f"{TRANSFORMS} 15 27", edit)["printed"]
-    assert re.search(r"(?m)^0 of [\d,]+ values differ over 200 seeds", printed)
-
-
-def test_exercise_03_3(build):
-    with pytest.raises(InputError, match="100.*16"):
-        run("03", NETWORK, ("SIZE = settings.sizes.image_size", "SIZE = 100"))
-
-
 @pytest.mark.torture
-def test_exercise_04_2(networks):
+def test_exercise_04_2(lessons):
     same = run("04", LOSSES, (CROSS_ENTROPY, "other_loss = total_loss"))
     first, second = (same[name].history for name in ("history1", "history2"))
     assert len(second) == 3 and second == {name: first[name] for name in second}
@@ -266,7 +223,7 @@ def test_exercise_04_1(choose):
     """In the lab: the cross-entropy is ahead after two and four epochs, not after six."""
     choose(PROFILE="lab")
     run("01", READING.replace("03", "03 05") + " 25")
-    run("02", f"{TRANSFORMS} 32 08 24 29 17 34")
+    run("02", DOUBLED)
     run("03", f"{NETWORK} 27")
     ahead = []
     for epochs in (2, 4, 6):
@@ -325,13 +282,6 @@ def test_your_masks_stand_beside_the_thesiss(build):
         assert written == {"width": 10} | settings, exercise
 
 
-def test_answers_run_when_somebody_asks_for_them(build):
-    ids = f"{FIRST} 08 09 12 13 46 50"
-    waiting = run("06", ids)
-    assert waiting["runs"] == {} and not waiting["RUN_ANSWERS"]
-    assert len(run("06", ids, ("RUN_ANSWERS = False", "RUN_ANSWERS = True"))["runs"]) == 5
-
-
 def test_notebooks_6_and_7_can_be_opened_first(build):
     (build / "labels").unlink()
     printed = run("07", "01 02 03 04 06")["printed"]
@@ -343,25 +293,6 @@ def test_notebooks_6_and_7_can_be_opened_first(build):
     assert len(list((build / "labels").glob("*/*.png"))) == 10
 
 
-def test_what_a_lesson_that_is_opened_first_makes_are_the_bits_of_earlier_lessons(networks):
-    written = sorted([*networks.glob("data/*.npy"), networks / "network.keras"])
-    before = [path.read_bytes() for path in written]
-    assert len(written) == 11
-    shutil.rmtree(networks / "data")
-    weights = training_weights(networks / "network.keras")
-    (networks / "network.keras").unlink()
-    run("04", "01 02 27 03 05")
-    assert [path.read_bytes() for path in written[:-1]] == before[:-1]
-    assert training_weights(earlier.network()) == weights
-
-
-def training_weights(path):
-    """The digest of the weights of a network."""
-    from thesis_repro.segmentation import training
-
-    return training.weights_digest(training.load_model(path))
-
-
 def test_a_cell_that_compiles_says_so_once(capsys, monkeypatch):
     monkeypatch.setattr(numba.core.event, "_registered", defaultdict(list))  # begun before or not
     artefacts.say_that_it_compiles.cache_clear()
@@ -371,23 +302,18 @@ def test_a_cell_that_compiles_says_so_once(capsys, monkeypatch):
     assert capsys.readouterr().out.count("compiling") == 1
 
 
-def test_notebook_9_says_whose_runs_it_reads(build, small_model):
+def test_notebook_9_says_whose_runs_it_reads(build):
     assert "real streets" in run("09", "14", earlier=earlier)["printed"]
-    labels, settings = build / "labels", {"run": {"masks": ["label maps"]}}
-    labels.unlink()
-    earlier.label_maps()
-    digest = provenance.digest_of_files(sorted((labels / "00").glob("*.png")))
-    settings["run"]["files"] = digest
-    (build / "odometry/00").mkdir(parents=True)
-    (build / "odometry/00/settings.json").write_text(json.dumps(settings))
     for name in ("runs.csv", "shuffled_runs.csv"):
         shutil.copy(earlier.EVIDENCE / name, build)
-    assert earlier.results()[2] == "this run, label maps: by the model in the package"
-    (build / "model").mkdir()
-    shutil.copy(small_model, build / "model")
-    run("05", PREDICTION)  # replaces the label maps
-    whose = earlier.results()[2]
-    assert "by the model in the package (replaced since" in whose
+    assert earlier.results()[2] == "this run"
+
+
+def test_lessons_2_and_4_name_the_notebook_that_they_need(build):
+    with pytest.raises(InputError, match="data.*01_load_images_and_labels"):
+        run("02", "02 20 03 04")
+    with pytest.raises(InputError, match="data.*02_augmentation"):
+        run("04", "01 02 27 03 05")
 
 
 def label_maps_by(*edits):
@@ -398,13 +324,14 @@ def label_maps_by(*edits):
     return names["whose"], names["model"].input_shape[1], names["note"]
 
 
-def test_label_maps_are_of_the_model_that_notebook_5_names_in_any_order(images, small_model):
-    (images / "labels").unlink()
+@pytest.mark.notebooks
+def test_label_maps_are_of_the_model_that_notebook_5_names_in_any_order(lessons, small_model):
+    (lessons / "labels").unlink()
     run("06", FIRST)  # opened first
     assert label_maps_by()[0] == "the model in the package"  # notebook 4 was not run
     assert artefacts.data_note().endswith("label maps: by the model in the package")
-    (images / "model").mkdir()
-    shutil.copy(small_model, images / "model")
+    (lessons / "model").mkdir()
+    shutil.copy(small_model, lessons / "model")
     own = "the model of this run", 64, read_settings().data_note
     package = "the model in the package", 320, f"{own[2]}; label maps: by the model in the package"
     shipped = "SHIPPED = not artefacts.is_trained()", "SHIPPED = True"
@@ -414,19 +341,20 @@ def test_label_maps_are_of_the_model_that_notebook_5_names_in_any_order(images, 
     assert artefacts.data_note() == own[2]
 
 
-def test_label_maps_of_an_earlier_training_or_of_two_networks_are_named(images, small_model):
-    folder = images / "model"
+@pytest.mark.notebooks
+def test_label_maps_of_an_earlier_training_or_of_two_networks_are_named(lessons, small_model):
+    folder = lessons / "model"
     folder.mkdir()
     shutil.copy(small_model, folder)
-    (images / "labels").unlink()
+    (lessons / "labels").unlink()
     label_maps_by()
     again = artefacts.model_of_run()
     again.set_weights([weights + 0.1 for weights in again.get_weights()])
     again.save(folder / "model.keras")
     with pytest.raises(InputError, match="labels.*05_prediction"):
         artefacts.used_model()
-    shutil.rmtree(images / "labels/00")  # as if notebook 5 was stopped after its first sequence
-    provenance.stage(images / "labels/00", model="another")
+    shutil.rmtree(lessons / "labels/00")  # as if notebook 5 was stopped after its first sequence
+    provenance.stage(lessons / "labels/00", model="another")
     for opened in (lambda: run("06", FIRST), artefacts.used_model, artefacts.data_note):
         with pytest.raises(InputError, match="labels.*two networks.*05_prediction"):
             opened()
@@ -454,7 +382,7 @@ def test_your_loop_stands_beside_the_thesiss(build):
         first, yours, printed = rows_of("07", LOOP, edit)
         assert first.equals(thesis) and holds(yours / thesis), exercise
         assert ("EDITED" in printed) == is_marked, exercise
-    run("06", MASKS, YOUR_MASKS["06_3"][0])
+    run("06", MASKS, YOUR_MASKS["06_2"][0])
     printed = run("07", "01 02 03 04 06")["printed"]
     assert "masks: {'width': 3} (not the thesis's" in printed
 
@@ -469,7 +397,7 @@ def ranges(*edits):
     return rows.min(), rows.max()
 
 
-def test_exercises_07_1_and_07_3(build):
+def test_exercise_07_1(build):
     long = (
         "drives[SEQUENCE or min(drives)].subset(FRAMES)",
         "earlier.Sequence(settings.kitti, '00')",
@@ -481,16 +409,11 @@ def test_exercises_07_1_and_07_3(build):
 
 
 @pytest.mark.torture
-def test_errors_of_the_lab_that_exercises_06_2_07_1_and_07_2_promise(choose):
+def test_errors_of_the_lab_that_exercise_07_1_promises(choose):
     choose(PROFILE="lab")
-    thesis, sky, _ = rows_of("06", MASKS, SKY)  # as if opened first
-    assert sky["keypoints"] < 0.3 * thesis["keypoints"] and sky[ROTATION] > 3 * thesis[ROTATION]
-    run("06", MASKS)
     low, high = ranges()
     assert low.loc["500 keypoints", "RMSE (m)"] < high.loc["as above", "RMSE (m)"]
     assert low.loc["500 keypoints", ROTATION] > high.loc["as above", ROTATION]
-    thesis, small, _ = rows_of("07", LOOP, WINDOW_OF_5)
-    assert small[ROTATION] > 1.2 * thesis[ROTATION]
 
 
 @pytest.fixture
@@ -513,30 +436,12 @@ def test_exercise_08_1(streets, metric):
     assert set(names["answers"].index) == {"se3", "rotation", "rmse"}
 
 
-def test_exercises_08_2_and_08_3(streets):
+def test_exercise_08_2(streets):
     runs, shuffled = streets
-    masked = runs.query("method == 'masked' and estimator == 'thesis'")
-    by_width = run("08", "54", masked=masked)["by_width"]
-    best = pd.DataFrame(run("08", "52", pd=pd, by_width=by_width)["widths_of"])
-    assert (best["rmse"] != best["se3"]).any()
-    widths = tuple(sorted(masked["dilation_width"].unique()))
+    widths = tuple(sorted(runs["dilation_width"].dropna().unique()))
     names = {"section_4_2": section_4_2, "shuffled": shuffled, "pd": pd}
     means = list(run("08", "53", WIDTHS=widths, **names)["means"].values())
     assert means == sorted(means, reverse=True) and means[0] > -1 and means[-1] < -10
-
-
-def test_exercise_08_4(build):
-    edits = ("FRAMES = settings.sizes.frames", "FRAMES = 12"), (ALL_SEQUENCES, '["00"]')
-    rows = []
-    for settings in ({"width": 10}, {"width": 10, "classes": ["sky"]}):
-        (build / "masks.json").write_text(json.dumps(settings))
-        names = run("08", "01 02 03 05 07 08", *edits)
-        masked = [job for job in names["first"] if job.method == "masked"]
-        rows.append(names["run"](masked))
-    usual, sky = (each["mean_keypoints"].mean() for each in rows)
-    assert sky < usual / 5
-    usual, sky = (ratios.has_failed(each).sum() for each in rows)
-    assert sky > usual
 
 
 def test_exercise_09_1():
