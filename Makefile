@@ -46,7 +46,7 @@ help:
 	@echo "make bench       measure the relative cost of odometry and network (KITTI=/path), into build/bench.json"
 	@echo "make pictures    draw the pictures of real streets from KITTI=build/excerpts"
 	@echo "make weights     train the shipped model anew into build/shipped, CAMVID=/path KITTI_SEMANTIC=/path PSEUDO=/path"
-	@echo "make book        after make figures: write all of its book, with the reference, into build/; a warning is an error"
+	@echo "make book        after make figures: write its book into build/; a warning is an error"
 	@echo "make page, pins  write gallery, README and docs/answer.md anew from the tables in git; resolve the pins of environment.txt anew"
 	@echo "make setup       install the pinned packages into .venv (GPU=1: and CUDA); make clean: delete .venv and all results"
 

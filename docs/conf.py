@@ -2,7 +2,6 @@
 
 import json
 import re
-from collections import defaultdict
 from pathlib import Path
 
 from docutils import nodes
@@ -10,29 +9,11 @@ from docutils.utils.math.latex2mathml import tex2mathml
 
 ROOT = Path(__file__).resolve().parents[1]
 CAPTIONS = ROOT / "notebooks/thesis/captions.json"
-CLAIMS = ROOT / "figures/kitti_excerpts/claims.md"
 BOOK = ""  # where the book is hosted, once it is: README then links it
-CARDS = {  # a picture of each lesson on the first page
-    "01_load_images_and_labels": "figures/figure_3_05.svg",
-    "02_augmentation": "figures/figure_3_01.webp",
-    "03_unet": "figures/figure_2_07.svg",
-    "04_training": "figures/figure_4_01.svg",
-    "05_prediction": "figures/figure_4_03.webp",
-    "06_keypoint_masks": "figures/figure_3_06.webp",
-    "07_visual_odometry": "figures/figure_2_09.webp",
-    "08_results": "figures/comparison.svg",
-    "09_audit": "figures/figure_2_10.svg",
-}
-PACKAGES = ("thesis_repro", "keypoint_study", "opencv_exact", "street_world")
 
 project = html_title = "Keypoint masks for visual odometry"
-extensions = ["myst_nb"]
-if tags.has("reference"):  # noqa: F821 (Sphinx defines it; `make book` sets it)
-    extensions.append("autoapi.extension")
-autoapi_dirs = [str(ROOT / package) for package in PACKAGES]
-suppress_warnings = ["autoapi.python_import_resolution"]  # of names that are set in pairs
-autoapi_options = ["members", "show-inheritance", "show-module-summary"]
-include_patterns = ["**.md", "notebooks/*.ipynb", "autoapi/**"]
+extensions = ["myst_nb", "sphinx.ext.autodoc"]
+include_patterns = ["**.md", "notebooks/*.ipynb"]
 exclude_patterns = ["docs/index.md"]  # it is index.md, too
 nb_execution_mode = "off"
 nb_ipywidgets_js: dict = {}  # they would come from the network; pictures stand for sliders
@@ -44,7 +25,7 @@ html_theme = "sphinx_book_theme"
 html_theme_options = {"navbar_persistent": []}  # one field for searches, not two
 html_math_renderer = "mathml"  # browsers show it without scripts, so without the network
 html_static_path = html_css_files = ["book.css"]
-html_show_copyright = False
+html_show_copyright = html_domain_indices = False
 author = "the contributors of thesis-repro"
 html_last_updated_fmt = None
 
@@ -52,57 +33,24 @@ PICTURE = re.compile(r'(<img\b[^>]*?\bsrc="([^"]+)"[^>]*>)')
 SCROLLS = re.compile(r'<div class="(?:pst-scrollable-table-container|output text_html|equation)"')
 
 captions = json.loads(CAPTIONS.read_text(encoding="utf-8"))
+titles = {
+    each["name"]: each["title"] for chapter in captions["chapters"].values() for each in chapter
+}
+# of pages that are a table alone
+PLACES = {"figures/kitti_excerpts": " on real frames", "figures/camvid": ", trained on CamVid"}
 
 
 def in_book(app, docname, source):
     """Complete the text of a page before it is read."""
     folder, _, name = docname.rpartition("/")
     if folder == "notebooks":
-        for path in (CAPTIONS, __file__):
-            app.env.note_dependency(path)
         source[0] = lesson(name, json.loads(source[0]))
     elif docname == "index":
-        for path in (CLAIMS, CAPTIONS, __file__):
-            app.env.note_dependency(path)
-        source[0] = source[0].replace("<!-- claims -->", claims_in_short())
-        source[0] = source[0].replace("<!-- cards -->", cards())
         if not Path(app.srcdir, "results").is_dir():  # the default run's is the gallery
             source[0] = source[0].replace("/results/README\n", "")
     elif folder and not re.match(r"(<!--.*?-->\s*)?#", source[0], re.DOTALL):  # without a title
-        title = name.replace("_", " ").capitalize()
+        title = titles.get(name, name.replace("_", " ").capitalize()) + PLACES.get(folder, "")
         source[0] = f"---\norphan: true\n---\n# {title}\n\n{source[0]}"
-
-
-def claims_in_short():
-    """Return the claims of the thesis as a small table: how many have each word, and which."""
-    of_word = defaultdict(list)
-    lines = CLAIMS.read_text(encoding="utf-8").splitlines() if CLAIMS.is_file() else []
-    for line in lines:
-        cells = [cell.strip() for cell in line.split("|")]
-        if len(cells) == 7 and cells[1] not in ("where", ":---"):
-            of_word[cells[4]].append(re.sub(r" \(.*\)$", "", cells[2]))
-    rows = ["| claims | what became of them | such as |", "| ---: | :--- | :--- |"]
-    for word, said in sorted(of_word.items(), key=lambda each: len(each[1])):
-        rows.append(f"| {len(said)} | {word} | {' '.join(said[:3])} |")
-    return "\n".join(rows)
-
-
-def cards():
-    """Return a card for each lesson: its picture, its title, and what it does."""
-    first = json.loads((ROOT / "notebooks/01_load_images_and_labels.ipynb").read_text())
-    text = "".join(first["cells"][0]["source"])
-    does = dict(re.findall(r"(?m)^\| `(\w+)` \| ([^|]*?) \|", text))
-    parts = ['<div class="cards">']
-    for name, picture in CARDS.items():
-        notebook = json.loads((ROOT / f"notebooks/{name}.ipynb").read_text())
-        title = "".join(notebook["cells"][0]["source"]).splitlines()[0].removeprefix("# ")
-        seen = captions["seen"][Path(picture).stem]
-        link = f"/notebooks/{name}.ipynb"
-        parts.append(
-            f'<div class="card">\n\n[![{seen}](/{picture})]({link})\n\n**[{title}]({link})** '
-            f"{does.get(name, '')}.\n\n</div>"
-        )
-    return "\n\n".join([*parts, "</div>"])
 
 
 def lesson(name, notebook):
@@ -145,7 +93,7 @@ def reach_by_all(app, pagename, templatename, context, doctree):
         context["generate_toctree_html"] = lambda *given, **named: str(
             made(*given, **named)
         ).replace("<summary>", '<summary aria-label="pages below this one">')
-    if "body" not in context or pagename.startswith("autoapi"):
+    if "body" not in context:
         return
     body = SCROLLS.sub(r'\g<0> tabindex="0"', context["body"])
     body = re.sub(r"<th(?: class=\"head\")?>(?:<p></p>)?</th>", "<td></td>", body)  # heads nothing

@@ -1,6 +1,5 @@
 """The book: executed notebooks, gallery and documents as pages to read in a browser."""
 
-import filecmp
 import shutil
 import subprocess
 import sys
@@ -32,18 +31,18 @@ PARTS = (
 )
 
 
-def build(settings: Settings, *options: str) -> int:
-    """Write the book of a run, and return Sphinx's status. Only pages that changed are read again.
-
-    options: for Sphinx.
-    """
+def build(settings: Settings) -> int:
+    """Write the book of a run, and return Sphinx's status. A warning is an error."""
     folder = settings.build / "book"
-    _arrange(_parts(settings), folder)
-    pages = folder / "html"
-    places = ["-c", ROOT / "docs", "-d", folder / "read", folder / "source", pages]
-    command = [sys.executable, "-m", "sphinx", "--quiet", *options, *map(str, places)]
-    status = subprocess.run(command).returncode
-    print(f"to read: {pages / 'index.html'}")
+    shutil.rmtree(folder, ignore_errors=True)
+    for place, path in _parts(settings).items():
+        copy = folder / "source" / place
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(path, copy)
+    places = ["-c", ROOT / "docs", "-d", folder / "read", folder / "source", folder / "html"]
+    command = [sys.executable, "-m", "sphinx", "--quiet", "--fail-on-warning", "--keep-going"]
+    status = subprocess.run([*command, *map(str, places)]).returncode
+    print(f"to read: {folder / 'html' / 'index.html'}")
     return status
 
 
@@ -61,31 +60,12 @@ def _parts(settings: Settings) -> dict[Path, Path]:
     return parts
 
 
-def _arrange(parts: dict[Path, Path], folder: Path) -> None:
-    """Make a book's source hold copies of these files and no others. What is equal stays.
-
-    Every page lists all, so a book of other files, such as an earlier version's, is written anew.
-    """
-    source = folder / "source"
-    there = {path.relative_to(source) for path in source.rglob("*") if path.is_file()}
-    if there != set(parts):
-        shutil.rmtree(folder, ignore_errors=True)
-    for place, path in parts.items():
-        copy = source / place
-        if not (copy.is_file() and filecmp.cmp(path, copy, shallow=False)):
-            copy.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(path, copy)
-
-
 def main() -> int:
-    """Write the whole book, with the reference. A warning is an error.
-
-    Raises InputError if no notebook has been executed.
-    """
+    """Write the book. Raises InputError if no notebook has been executed."""
     settings = read_settings()
     if not listed(settings.build / "notebooks", "*.ipynb"):
         raise InputError(f"{settings.build}: has no executed notebook; run make figures first")
-    return build(settings, "--tag", "reference", "--fail-on-warning", "--keep-going")
+    return build(settings)
 
 
 if __name__ == "__main__":
