@@ -5,7 +5,7 @@ estimator, repetition, frames, mean_keypoints, flagged, and one column for each 
 
 **Comparisons** (`comparisons_of`) have one row for each method, reference, metric and estimator:
 the ratio of the method's error to the reference's with its interval (`ratios`), a verdict
-(`verdicts.ERROR`), on how many sequences each fails, and the ratios of the sequences. The rows
+(`verdicts.verdict`), on how many sequences each fails, and the ratios of the sequences. The rows
 that answer the main question are those that `decide`.
 
 The functions below it select parts of a table of runs.
@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from keypoint_study import methods, ratios, verdicts
+from keypoint_study import methods, ratios
 from keypoint_study.jobs import CONTROL_WIDTH, ESTIMATOR_TITLES
 from keypoint_study.methods import MASK_CONTROLS, METHODS
 from keypoint_study.path_errors import ERRORS
@@ -110,7 +110,7 @@ def comparisons_of(runs: pd.DataFrame) -> pd.DataFrame:
                     and estimator == judging,
                     "far_off": ratios.far_off(by_sequence),
                     **typical,
-                    "verdict": verdict(verdicts.ERROR, typical["n"], [side]),
+                    "verdict": verdict(typical["n"], [side]),
                     **of_failures,
                     "ratios": dict(by_sequence),
                 }
@@ -137,7 +137,7 @@ def failures(failed: pd.Series, reference: pd.Series) -> dict[str, Any]:
         "reference_failed": ratios.count_failing(reference),
         "more_failures": more,
         "fewer_failures": fewer,
-        "failures_verdict": verdict(verdicts.FAILURES, len(differences), [side]),
+        "failures_verdict": verdict(len(differences), [side]),
     }
 
 
@@ -145,7 +145,7 @@ def verdict_of(rows: pd.DataFrame) -> str:
     """Return the verdict of several rows of `comparisons_of` together, such as both that decide."""
     sides = [ratios.side_of_one(low, high) for low, high in zip(rows["low"], rows["high"])]
     fewest = rows["n"].min() if len(rows) else 0
-    return verdict(verdicts.ERROR, fewest, sides)
+    return verdict(fewest, sides)
 
 
 def _variants(

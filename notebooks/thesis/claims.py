@@ -28,6 +28,7 @@ from scipy.stats import binomtest
 
 from keypoint_study import comparisons, ratios, verdicts
 from keypoint_study.jobs import CONTROL_WIDTH
+from keypoint_study.path_errors import ERRORS
 from keypoint_study.report import style, texts
 from thesis import audit_of_tables, equal_number, section_4_2
 from thesis.reported import REPORTED
@@ -44,7 +45,7 @@ RULE = {  # for readers
     "for a claim about one), or the procedure gives the same where masks do nothing. That something "
     f"can happen is not refuted by streets on which it does not. A few hundred are at most {HUNDREDS}.",
 }
-MARGIN = verdicts.FEW_KEYPOINTS.margins["se3"]  # of the RMSE and the MAE, too: errors of a path
+MARGIN = ERRORS["se3"].margin  # of the RMSE and the MAE, too: errors of a path
 REAL = "kitti_excerpts/"  # tables on real frames
 LIMIT = THESIS.max_keypoints
 REDUCTION = REPORTED["headline_claims"]["keypoint_reduction_factor"]

@@ -1,7 +1,7 @@
 """Choices of keypoints at an equal number, and what each verdict hangs on.
 
 A mask leaves fewer keypoints than the detector finds. Here as many are compared, from the runs of
-`few_keypoints`. A verdict on both deciding errors (`verdicts.ERROR`) is then asked again: without
+`few_keypoints`. A verdict on both deciding errors (`verdicts.verdict`) is then asked again: without
 each street, each two and each day, without the streets on which something was chosen, and with
 Student's t in place of the signed rank. One that stays everywhere hangs on none of them.
 """
@@ -15,8 +15,9 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from keypoint_study import comparisons, ratios
+from keypoint_study.path_errors import ERRORS
 from keypoint_study.report import style, texts
-from keypoint_study.verdicts import ERROR, verdict
+from keypoint_study.verdicts import verdict
 
 DECIDING = comparisons.JUDGING_METRICS
 SHOWN = {"thesis": "thesis's estimator", "refined": "refined estimator"}
@@ -77,7 +78,7 @@ def word(of_streets: pd.DataFrame, ends: tuple[str, str] = ("low", "high")) -> s
     """Return the verdict on both errors. ends: of the interval, in `ratios.typical_ratio`."""
     typical = [ratios.typical_ratio(of_streets[name]) for name in DECIDING]
     sides = [ratios.side_of_one(*(each[end] for end in ends)) for each in typical]
-    return verdict(ERROR, len(of_streets), sides)
+    return verdict(len(of_streets), sides)
 
 
 def hangs_on(of_streets: pd.DataFrame) -> dict[str, Any]:
@@ -156,7 +157,6 @@ def figure_of_choices(few: pd.DataFrame) -> Figure:
     """Draw the errors of six choices of keypoints, over those of all, with both estimators."""
     drawing, panels = style.new_figure(1, len(DECIDING), 2.6, sharex=True, sharey=True)
     looks = {"thesis": (style.BLUE, -0.15), "refined": (style.RED, 0.15)}
-    titles = dict(zip(DECIDING, ("error of the path", "error of the rotations")))
     for panel, error in zip(panels, DECIDING, strict=True):
         for estimator, (color, aside) in looks.items():
             runs = few[few["estimator"] == estimator]
@@ -171,7 +171,7 @@ def figure_of_choices(few: pd.DataFrame) -> Figure:
                 mark = {"color": color, "markersize": 4, "label": label}
                 panel.plot(typical["ratio"], place + aside, "D", **mark)
         style.ratio_rows(panel, list(DRAWN), REACH)
-        panel.set_title(titles[error])
+        panel.set_title(ERRORS[error].plainly)
         panel.set_xlabel("divided by that of all keypoints", fontsize=8)
     style.legend_below(drawing, panels[:1], 2)
     return drawing

@@ -2,7 +2,7 @@
 
 A choice is compared with all keypoints, with the same estimator. The errors are the aligned ATE and
 the rotational RPE over one frame, as they are for every run, lost or not. Sequences on which a
-choice fails are counted beside the ratio, not mixed in. The verdict (`verdicts.FEW_KEYPOINTS`) is
+choice fails are counted beside the ratio, not mixed in. The verdict (`verdicts.verdict_on_few`) is
 that of both errors and both estimators together. Its rule was fixed before the runs that the tables
 show, but when a prototype's results on the same streets were known.
 """
@@ -25,7 +25,7 @@ from keypoint_study.methods import FEW, METHODS, of_group
 from keypoint_study.report import style, texts
 from keypoint_study.runner import run_all
 from keypoint_study.sources import Source
-from keypoint_study.verdicts import FEW_KEYPOINTS, verdict
+from keypoint_study.verdicts import verdict_on_few
 from thesis_repro import odometry
 from thesis_repro.data.sequence import Sequence
 from thesis_repro.running import provenance
@@ -45,8 +45,7 @@ COLUMNS = (
     "estimator",
     "repetition",
     "keypoints",
-    "se3",
-    "rotation",
+    *comparisons.JUDGING_METRICS,
     "failed",
 )
 # choices and numbers that are run with every second frame, too
@@ -182,7 +181,7 @@ def verdict_on(chosen: pd.DataFrame, reference: pd.DataFrame) -> str:
             of_streets = ratios.ratios_of(arms[0], arms[1], error)
             counts.append(len(of_streets))
             narrow.append((error, *ratios.narrow_interval(of_streets)))
-    return verdict(FEW_KEYPOINTS, min(counts), narrow=narrow, fails_more=fails_more)
+    return verdict_on_few(min(counts), narrow, fails_more)
 
 
 def table_of_few(rows: pd.DataFrame, times: pd.DataFrame | None = None) -> pd.DataFrame:

@@ -5,50 +5,57 @@ import pandas as pd
 import pytest
 
 from keypoint_study import ratios, verdicts
-from keypoint_study.verdicts import ERROR, FAILURES, FEW_KEYPOINTS, verdict
+from keypoint_study.path_errors import ERRORS
+from keypoint_study.verdicts import verdict, verdict_on_few
 
 INSIDE = [("se3", 0.81, 1.24), ("rotation", 0.92, 1.09)]
 BETTER = [("se3", 0.5, 1.24), ("rotation", 0.92, 0.95)]
 
 
 @pytest.mark.parametrize(
-    "rule, outcome, word",
+    "sides, word",
     [
-        (ERROR, {"sides": [-1, -1]}, "lower"),
-        (ERROR, {"sides": [1]}, "higher"),
-        (ERROR, {"sides": [1, -1]}, "no clear difference"),
-        (ERROR, {"sides": [-1, 0]}, "no clear difference"),
-        (FAILURES, {"sides": [1]}, "higher"),
-        (FEW_KEYPOINTS, {"narrow": INSIDE}, "as good"),
-        (FEW_KEYPOINTS, {"narrow": INSIDE, "fails_more": True}, "neither"),
-        (FEW_KEYPOINTS, {"narrow": BETTER}, "no worse"),
-        (FEW_KEYPOINTS, {"narrow": [*BETTER, ("rotation", 1, 1.11)]}, "neither"),
-        (FEW_KEYPOINTS, {"narrow": [("se3", 1, float("nan"))]}, "neither"),
+        ([-1, -1], "lower"),
+        ([1], "higher"),
+        ([1, -1], "no clear difference"),
+        ([-1, 0], "no clear difference"),
+        ([], "no clear difference"),
     ],
 )
-def test_the_word_is_that_of_the_rule_and_five_sequences_have_none(rule, outcome, word):
-    assert verdict(rule, 6, **outcome) == word
-    assert verdict(rule, 5, **outcome) == verdicts.TOO_FEW
+def test_all_intervals_have_to_lie_on_one_side(sides, word):
+    assert verdict(6, sides) == word and verdict(5, sides) == verdicts.TOO_FEW
 
 
-MARGINS = [
-    (FEW_KEYPOINTS, "se3", 1.25, "as good", "no worse", "neither"),
-    (FEW_KEYPOINTS, "rotation", 1.1, "as good", "no worse", "neither"),
-]
+@pytest.mark.parametrize(
+    "narrow, fails_more, word",
+    [
+        (INSIDE, False, "as good"),
+        (INSIDE, True, "neither"),
+        (BETTER, False, "no worse"),
+        (BETTER, True, "neither"),
+        ([*BETTER, ("rotation", 1, 1.11)], False, "neither"),
+        ([("se3", 1, float("nan"))], False, "neither"),
+    ],
+)
+def test_few_keypoints_are_as_good_no_worse_or_neither(narrow, fails_more, word):
+    assert verdict_on_few(6, narrow, fails_more) == word
+    assert verdict_on_few(5, narrow, fails_more) == verdicts.TOO_FEW
 
 
-@pytest.mark.parametrize("rule, name, margin, within, under, otherwise", MARGINS)
-def test_an_interval_is_within_its_margin_or_a_thousandth_outside(
-    rule, name, margin, within, under, otherwise
-):
-    others = [(each, 1, 1) for each in rule.margins if each != name]
+MARGINS = {name: error.margin for name, error in ERRORS.items() if error.decides}
+
+
+@pytest.mark.parametrize("name", MARGINS)
+def test_an_interval_is_within_its_margin_or_a_thousandth_outside(name):
+    margin = MARGINS[name]
+    others = [(each, 1, 1) for each in MARGINS if each != name]
     for low, high, word in (
-        (1 / margin + 0.001, margin - 0.001, within),
-        (1 / margin - 0.001, margin - 0.001, under),
-        (1 / margin + 0.001, margin + 0.001, otherwise),
-        (1 / margin + 0.001, margin, otherwise),
+        (1 / margin + 0.001, margin - 0.001, "as good"),
+        (1 / margin - 0.001, margin - 0.001, "no worse"),
+        (1 / margin + 0.001, margin + 0.001, "neither"),
+        (1 / margin + 0.001, margin, "neither"),
     ):
-        assert verdict(rule, 6, narrow=[*others, (name, low, high)]) == word
+        assert verdict_on_few(6, [*others, (name, low, high)], False) == word
 
 
 @pytest.mark.parametrize(

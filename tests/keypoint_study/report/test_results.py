@@ -13,6 +13,7 @@ from matplotlib.container import BarContainer
 
 from keypoint_study import comparisons, ratios, verdicts
 from keypoint_study.jobs import ESTIMATOR_TITLES
+from keypoint_study.path_errors import ERRORS
 from keypoint_study.report import comparison, findings, html, style, texts
 from thesis import chapter4, few_keypoints, frames, section_4_2
 from thesis.reported import REPORTED
@@ -120,9 +121,11 @@ def test_errors_are_means_with_their_spread_and_the_lowest_is_bold():
         "masks, width 10",
         *(comparisons.METHOD_TITLES[name] for name in CONTROLS),
     ]
-    assert list(table["method"]) == 4 * methods and list(table.columns[3:]) == ELEVEN
+    parts = 2 * len(comparisons.JUDGING_METRICS)  # estimators and errors
+    assert list(table["method"]) == parts * methods and list(table.columns[3:]) == ELEVEN
     assert list(table["estimator"].unique()) == ["thesis's estimator", "refined estimator"]
-    assert list(table["error"].unique()) == ["aligned ATE (m)", "rotational RPE, 1 frame (deg)"]
+    errors = [f"{error.title} ({error.unit})" for error in ERRORS.values() if error.decides]
+    assert list(table["error"].unique()) == errors
     masked = (runs["method"] == "masked") & (runs["dilation_width"] == 10)
     errors = runs[masked & (runs["estimator"] == "refined") & (runs["sequence"] == "03")]["se3"]
     cell = table[table["estimator"] == "refined estimator"].set_index("method").iloc[1]["03"]
@@ -130,11 +133,11 @@ def test_errors_are_means_with_their_spread_and_the_lowest_is_bold():
     assert (mean, spread) == pytest.approx((errors.mean(), errors.std()), abs=0.00051)
     bold = table[ELEVEN].map(lambda cell: cell.startswith("**"))
     of_masks = bold[table["method"] == "masks, width 10"]
-    assert (bold.sum() == 4).all() and of_masks.to_numpy().mean() > 0.9
+    assert (bold.sum() == parts).all() and of_masks.to_numpy().mean() > 0.9
     own = runs[runs["method"] == "baseline"].assign(method="keypoints", source="mine")
     beside = pd.concat([runs_of(ELEVEN, halved, noise=0.2, sources=("net",)), own])
     shown = comparison.table_of_errors(comparisons.comparisons_of(beside), beside).content
-    assert len(shown) == len(table) + 4 and "mine" in set(shown["method"])
+    assert len(shown) == len(table) + parts and "mine" in set(shown["method"])
     once = runs[runs["repetition"] == 0]
     single = comparison.table_of_errors(comparisons.comparisons_of(once), once).content
     assert not single[ELEVEN].map(lambda cell: "±" in cell).any(axis=None)
