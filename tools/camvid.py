@@ -27,7 +27,7 @@ from thesis.settings import PROFILES, ROOT
 from thesis_repro.data import cityscapes, kitti
 from thesis_repro.data.sequence import Sequence
 from thesis_repro.running import files, program, provenance
-from thesis_repro.segmentation import augmentation, quietly
+from thesis_repro.segmentation import augmentation
 
 SIZES = PROFILES["thesis"]
 SMOOTH = 1e-5  # of segmentation-models: an absent class scores 1
@@ -125,7 +125,7 @@ def train(folder, train_set, validation_set, seed, epochs):
     rows = pd.read_csv(folder / HISTORY).to_dict("records") if (folder / HISTORY).exists() else []
     if is_done(rows, epochs):
         return
-    with quietly():
+    with program.quiet():
         import keras
 
     keras.utils.set_random_seed(seed)
