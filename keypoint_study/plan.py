@@ -9,10 +9,11 @@ import pandas as pd
 
 from keypoint_study import jobs, runner, sources
 from keypoint_study.sources import Source
+from thesis_repro import checks
 from thesis_repro.data.sequence import Sequence
 from thesis_repro.errors import InputError
-from thesis_repro.odometry import THESIS, metrics
-from thesis_repro.running import program, provenance
+from thesis_repro.odometry import THESIS
+from thesis_repro.running import provenance
 
 RUNS = "runs"  # folder of the results of the runs
 
@@ -24,7 +25,7 @@ class Study:
     sequences: their names. widths: pixels, for masks from label maps. tested: width of the
     controls, None for no controls. estimators: their names. frames: number of frames of each
     sequence, None for all. scale_gate: metres, see OdometrySettings. masked_settings: other
-    settings of the odometry, for all runs with masks. without_border: of Sequence.
+    settings of the odometry, for all runs with masks.
     """
 
     kitti: Path
@@ -37,15 +38,11 @@ class Study:
     frames: int | None = None
     scale_gate: float = THESIS.scale_gate
     masked_settings: dict[str, Any] = field(default_factory=dict)
-    without_border: bool = False
 
     @cached_property
     def opened(self) -> list[Sequence]:
         """The sequences, cut to `frames` frames."""
-        sequences = [Sequence(self.kitti, name).subset(self.frames) for name in self.sequences]
-        if self.without_border:
-            return [sequence.without_border() for sequence in sequences]
-        return sequences
+        return [Sequence(self.kitti, name).subset(self.frames) for name in self.sequences]
 
     def check(self) -> None:
         """Raise InputError for the first problem with the settings, the sequences or the masks."""
@@ -67,12 +64,10 @@ class Study:
     def run(self, folder: Path, processes: int = 1, scheduler: str | None = None) -> runner.Outcome:
         """Run the jobs whose results are not in the folder yet, see `runner.run_all`.
 
-        Sequences whose true poses are not the camera's are left out of the table, with a warning.
-        Raises InputError for a folder with results of another number of frames, and if no sequence
-        is left.
+        Raises InputError for a folder with results of another number of frames, and if the true
+        poses of a sequence fit better inverted.
         """
         settings = {"scale_gate": self.scale_gate}
-        more = {"without_border": True} if self.without_border else {}
         runs_of = partial(
             jobs.runs_of,
             sequences=self.opened,
@@ -90,7 +85,6 @@ class Study:
                 frames=self.frames,
                 **settings,
                 **self.masked_settings,
-                **more,
             )
             runs = runs_of(
                 jobs.first_jobs(
@@ -107,7 +101,7 @@ class Study:
                     "every run but those with all keypoints failed (see above), so there is nothing to "
                     "compare"
                 )
-            foreign = self._foreign_truths(first.table, folder)
+            self._check_truths(first.table, folder)
             if self.tested:
                 as_many = runner.keypoint_controls(
                     first.table,
@@ -119,37 +113,21 @@ class Study:
                 )
                 done = {job: run for job, run in runs.items() if job not in first.reasons}
                 outcome = run_all(done | runs_of(as_many)).after(first)
-        table = outcome.table[~outcome.table["sequence"].isin(foreign)]
-        warnings = [
-            *outcome.warnings,
-            *foreign.values(),
-            *runner.number_warnings(table, self.sources),
-        ]
-        return replace(outcome, table=table, warnings=warnings)
+        numbers = runner.number_warnings(outcome.table, self.sources)
+        return replace(outcome, warnings=[*outcome.warnings, *numbers])
 
-    def _foreign_truths(self, table: pd.DataFrame, folder: Path) -> dict[str, str]:
-        """Return a line for each sequence whose true poses are not the camera's, and print it.
-
-        Raises InputError if they are those of all sequences.
-        """
+    def _check_truths(self, table: pd.DataFrame, folder: Path) -> None:
+        """Raise InputError if a truth fits the paths of every estimator better inverted."""
         runs = table[(table["method"] == "baseline") & (table["repetition"] == 0)]
         poses = runner.run_poses(runs, folder / RUNS)
-        lines = {}
         for sequence in self.opened:
-            reasons = [
-                metrics.foreign_poses(sequence.poses, estimate)
+            told = [
+                checks.inverted_truth(sequence, estimate)
                 for (name, _), estimate in poses.items()
                 if name == sequence.name
             ]
-            if reasons and all(reasons):  # with every estimator
-                lines[sequence.name] = f"{sequence.poses_path}: true {reasons[0]}"
-        if set(runs["sequence"]) == set(lines):
-            line = next(iter(lines.values()))
-            raise InputError(f"{line}; no sequence with other poses is left to compare")
-        lines = {name: f"{line}; sequence {name} is left out" for name, line in lines.items()}
-        for line in lines.values():
-            program.log.warning(line)
-        return lines
+            if told and all(told):
+                raise InputError(told[0][0])
 
     @property
     def shown_width(self) -> int | None:

@@ -65,14 +65,9 @@ def _doubts(study: Study, runs: pd.DataFrame) -> Iterator[str]:
     """Yield warnings of the runs, one of each sequence and source at the shown width."""
     shown = runs["dilation_width"].isna() | (runs["dilation_width"] == study.shown_width)
     of_shown = runs[shown & runs["method"].isin(("baseline", *BROUGHT))]
-    standing = {sequence.name: checks.standing(sequence) for sequence in study.opened}
     for run in of_shown.drop_duplicates(["sequence", "source"]).itertuples():
-        yield from checks.run_warnings(
-            f"{run.sequence} {run.source}".strip(),
-            run.frames,
-            run.flagged,
-            standing=standing[run.sequence],
-        )
+        name = f"{run.sequence} {run.source}".strip()
+        yield from checks.run_warnings(name, run.frames, run.flagged)
 
 
 @style.applied()

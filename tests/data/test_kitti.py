@@ -179,15 +179,6 @@ def test_a_folder_of_drives_is_a_root_and_a_link_a_sequence(drive, tiny_kitti):
     assert [folder for folder, *_ in cli._image_folders(drive.parent)] == [drive]
 
 
-def test_a_gps_without_a_lock_is_told(drive):
-    assert checks.sequence_warnings(Sequence(None, drive)) == []
-    path = drive / "oxts/data/0000000002.txt"
-    numbers = path.read_text().split()
-    path.write_text(" ".join([*numbers[:23], "9.5", *numbers[24:]]))
-    (line,) = checks.sequence_warnings(Sequence(None, drive))
-    assert "9.5 m" in line and path.name in line
-
-
 @pytest.mark.parametrize(
     ("file", "text"),
     [

@@ -241,69 +241,6 @@ def test_a_small_angle_is_exact():
     assert metrics.angles(rotations) == pytest.approx(small, rel=1e-6)
 
 
-OPENGL = np.diag([1.0, -1, -1, 1])  # axes of a camera
-AXES = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])  # x forward, z up
-
-
-def quaternions(poses, order, sign=1):
-    """Poses whose quaternions x, y, z, w are read in another order, or as their inverse."""
-    read = np.array(poses)
-    numbers = Rotation.from_matrix(poses[:, :3, :3]).as_quat() * [sign, sign, sign, 1]
-    read[:, :3, :3] = Rotation.from_quat(numbers[:, order]).as_matrix()
-    return read
-
-
-@pytest.mark.parametrize(
-    "change, kind",
-    [
-        (lambda poses: poses, None),
-        (np.linalg.inv, "are world-to-camera poses; invert"),
-        (lambda poses: poses[::-1], "in reverse order"),
-        (lambda poses: OPENGL @ poses @ OPENGL, "diag(1, -1, -1, 1)"),
-        (lambda poses: poses @ OPENGL, "diag(1, -1, -1, 1)"),
-        (lambda poses: OPENGL @ np.linalg.inv(poses) @ OPENGL, "inv(poses) @ diag(1, -1, -1, 1)"),
-        (lambda poses: quaternions(poses, [3, 0, 1, 2]), "w first"),
-        (lambda poses: quaternions(poses, [1, 2, 3, 0]), "w last"),
-        (lambda poses: quaternions(poses, [0, 1, 2, 3], -1), "invert the rotations"),
-        (lambda poses: AXES @ poses @ AXES.T, "a body with other axes"),
-        (lambda poses: poses[np.random.default_rng(0).permutation(len(poses))], "do not fit"),
-    ],
-)
-def test_true_poses_that_are_not_the_cameras_are_told(change, kind):
-    true = winding(60)
-    estimated = true.copy()
-    estimated[:, :3, 3] += np.random.default_rng(1).normal(0, 0.05, (60, 3))
-    reason = metrics.foreign_poses(change(true), estimated)
-    assert reason == "" if kind is None else kind in reason
-    # a path of one camera without its scale
-    path = np.array(change(true))
-    path[:, :3, 3] *= 0.05
-    told = metrics.foreign_poses(path, estimated)
-    assert told == "" if kind is None else kind in told
-    # what did not move, and too few steps, say nothing
-    assert metrics.foreign_poses(change(true), np.tile(np.eye(4), (60, 1, 1))) == ""
-    assert metrics.foreign_poses(change(true)[:10], estimated[:10]) == ""
-    # steps that are too short alone count over a distance
-    slow, slowly = winding(120), winding(120)
-    slow[:, :3, 3] *= 0.1
-    slowly[:, :3, 3] = 0.1 * slowly[:, :3, 3] + np.random.default_rng(1).normal(0, 0.002, (120, 3))
-    assert metrics.travelled(slow)[-1] / 120 < 0.15
-    told = metrics.foreign_poses(change(slow), slowly)
-    assert told == "" if kind is None else kind in told
-
-
-def test_poses_without_rotations_are_told():
-    true = winding(60)
-    positions = np.tile(np.eye(4), (60, 1, 1))
-    positions[:, :3, 3] = true[:, :3, 3]
-    turned = AXES @ positions @ AXES.T  # as of a satellite: east, north, up
-    for poses in (positions, turned, turned @ AXES):
-        assert "no rotations" in metrics.foreign_poses(poses, true)
-    straight = np.tile(np.eye(4), (60, 1, 1))
-    straight[:, 2, 3] = np.arange(60)
-    assert metrics.foreign_poses(straight, straight) == ""  # a camera that does not turn
-
-
 @pytest.mark.parametrize("shape", [(5, 3), (5, 3, 4), (5, 16)])
 def test_paths_of_other_shapes_are_named(shape):
     for pair in ((np.zeros(shape), ahead(5)), (ahead(5), np.zeros(shape))):

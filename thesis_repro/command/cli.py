@@ -123,17 +123,9 @@ def odometry(options: Any) -> None:
     if options.tum:
         result.write_tum(options.tum)
     steps = len(sequence), result.failed_steps, result.dropped_steps
-    standing = checks.standing(sequence)
-    program.warn(checks.run_warnings(sequence.name, *steps, settings.scale_gate, standing))
+    program.warn(checks.run_warnings(sequence.name, *steps, settings.scale_gate))
     if sequence.has_truth:
-        reason = metrics.foreign_poses(sequence.poses, result.poses)
-        program.warn([f"{sequence.poses_path}: true {reason}"] * bool(reason))
-        length = metrics.travelled(sequence.poses)[-1]
-        if not reason and length < metrics.CHECKED_LENGTH:
-            program.log.info(
-                f"{sequence.poses_path}: the path, {length:.2g} m, is too short to check that true poses have the "
-                "camera's axes"
-            )
+        program.warn(checks.inverted_truth(sequence, result.poses))
     record = _record(result, sequence)
     if options.plot:
         truth, poses = None, result.poses
@@ -183,7 +175,6 @@ def study(options: Any) -> int:
         options.frames,
         options.scale_gate,
         {"detector": detector} if (detector := _detector(options)) else {},
-        options.without_border,
     )
     planned.check()
     folder = options.folder.absolute()
@@ -288,10 +279,7 @@ def _sequence(options: Any) -> Any:
     names = "speed", "fps", "truth", "calibration", "truth_within"
     own = {name: vars(options)[name] for name in names if name in vars(options)}
     sequence = Sequence(options.kitti, options.sequence, options.camera, **own)
-    sequence = sequence.subset(options.frames)
-    if vars(options).get("without_border"):
-        return sequence.without_border()
-    return sequence
+    return sequence.subset(options.frames)
 
 
 def _image_folders(root: Path, calibration: Path | None = None) -> list[tuple[Path, list, Any]]:

@@ -126,11 +126,6 @@ SHARED: dict[str, dict[str, Any]] = {
         metavar="METRES",
         help="a shorter step leaves the pose as it is; 0 for slow cameras and many frames a second (0.1)",
     ),
-    "--without-border": dict(
-        action="store_true",
-        help="no keypoints in and near parts that are black in all frames, as undistortion leaves them (transparent "
-        "parts never have any)",
-    ),
     "--spread": dict(
         type=values.positive_whole_number,
         metavar="N",
@@ -269,7 +264,7 @@ COMMANDS: dict[str, dict[str, Any]] = {
     "odometry": {
         **_shared(*SEQUENCE),
         **MASK_OPTIONS,
-        **_shared("--invert", "--scale-gate", "--without-border", "--spread", "--fill"),
+        **_shared("--invert", "--scale-gate", "--spread", "--fill"),
         "--truth": dict(
             type=path,
             metavar="FILE",
@@ -330,7 +325,7 @@ COMMANDS: dict[str, dict[str, Any]] = {
             metavar="NN",
             help="sequences to run (all in ROOT)",
         ),
-        **_shared("--frames", "--invert", "--scale-gate", "--without-border", "--spread", "--fill"),
+        **_shared("--frames", "--invert", "--scale-gate", "--spread", "--fill"),
         **MASK_OPTIONS,
         **_shared("--output"),
         "--labels": _source(

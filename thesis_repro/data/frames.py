@@ -38,8 +38,8 @@ class Files(NamedTuple):
     """What a layout finds in the folder of a sequence. All but the frames may be missing.
 
     frames: in their order. read_poses: a function of `poses`, the times and the largest difference
-    of times, as `trajectories.read_truth`. others: what the poses are made from as well. doubts:
-    lines that say what may be wrong. camera: name of the camera's folder.
+    of times, as `trajectories.read_truth`. others: what the poses are made from as well. camera:
+    name of the camera's folder.
     """
 
     frames: list[Path]
@@ -50,7 +50,6 @@ class Files(NamedTuple):
     read_times: Callable[[Path], np.ndarray] = read_times
     read_poses: Callable[[Path, np.ndarray | None, float], tuple] = read_truth
     others: tuple[Path, ...] = ()
-    doubts: Callable[[], list[str]] = list
     camera: str = ""
 
 

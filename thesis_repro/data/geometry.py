@@ -25,9 +25,6 @@ KNOWN_SIZES = {
     (round(camera.fx, 3), round(camera.cx, 3)): (camera.width, camera.height)
     for camera in CAMERAS.values()
 }
-# Of the principal point from the middle, in frame widths and heights. KITTI has at most 0.04.
-# Frames are cropped at their upper or lower edge more often than at their sides.
-MAX_CENTRE_OFFSET = 0.075, 0.15
 MIN_FRAME_SIDE = 16  # pixels; keypoints cannot be tracked in smaller frames
 ROTATION_TOLERANCE = 1e-3  # largest entry of R R^T - I; pose files have few digits
 
@@ -71,18 +68,6 @@ def check_camera(
             f"{path}: focal lengths {fx:g}, {fy:g} and centre {u:g}, {v:g} do not fit frames of "
             f"{width}x{height} pixels"
         )
-
-
-def centre_doubt(intrinsics: np.ndarray, size: tuple[int, int]) -> str:
-    """Return what is doubtful about the principal point in frames of a size, or an empty text."""
-    (height, width), (u, v) = size, intrinsics[:2, 2]
-    across, down = MAX_CENTRE_OFFSET
-    if abs(u / width - 0.5) <= across and abs(v / height - 0.5) <= down:
-        return ""
-    return (
-        f"the centre {u:g}, {v:g} is far from the middle of frames of {width}x{height} pixels; it must belong "
-        "to frames of this size"
-    )
 
 
 def are_poses(poses: np.ndarray) -> np.ndarray:

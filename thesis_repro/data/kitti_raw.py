@@ -22,7 +22,6 @@ LAYOUT = "a raw drive of KITTI (image_00/data, oxts/data)"
 IMAGE_FOLDERS = ("image_00", "image_02", "image_01", "image_03")
 FRAMES_FOLDER, TIMES, OXTS = "data", "timestamps.txt", "oxts/data"
 EARTH_RADIUS = 6378137.0  # metres
-ACCURACY, MAX_ACCURACY = 23, 1.0  # column of the GPS's error, and metres that are too many
 
 
 def is_mine(folder: Path) -> bool:
@@ -53,7 +52,6 @@ def files(folder: Path, camera: str | None) -> Files:
         read_times,
         partial(_read_truth, key=key),
         (*used, *_measurements(folder)),
-        partial(_doubts, folder),
         image_folder.parent.name,
     )
 
@@ -65,19 +63,6 @@ def calibration(folder: Path, name: str = "cam_to_cam") -> Path:
 
 def _measurements(folder: Path) -> list[Path]:
     return listed(folder / OXTS, "*.txt")
-
-
-def _doubts(folder: Path) -> list[str]:
-    """Say where the GPS was not sure of its place, so that the poses jump."""
-    paths = _measurements(folder)
-    errors = np.array([read_line(path, "", 30)[ACCURACY] for path in paths])
-    bad = np.flatnonzero(errors > MAX_ACCURACY)
-    if not len(bad):
-        return []
-    return [
-        f"{folder / OXTS}: the GPS was {errors.max():.3g} m off in {paths[errors.argmax()].name}, and more "
-        f"than {MAX_ACCURACY:g} m in {len(bad)} of {len(paths)} files, so true poses may jump"
-    ]
 
 
 def _read_truth(path: Path, times: np.ndarray, within: float, key: str) -> tuple:

@@ -18,10 +18,9 @@ from thesis_repro.errors import InputError
 from thesis_repro.running import provenance
 from thesis_repro.running.files import read_gray, read_unchanged
 
-# Pixels near a border where keypoints are left out: half a window of the tracker, which would see
-# the border's edge
-BORDER_MARGIN = 10
-BORDER_SAMPLES, BLACK = 12, 8  # frames, and the largest gray value of a border
+# Pixels near hidden parts where keypoints are left out: half a window of the tracker, which would
+# see their edge
+MARGIN = 10
 
 
 class Sequence:
@@ -63,7 +62,6 @@ class Sequence:
         """
         self.folder = layout.locate(root, name)
         self.name, self.speed = self.folder.name, speed
-        self.border: np.ndarray | None = None  # see `without_border`
         files = layout.files(self.folder, camera)
         own_calibration = files.calibration
         if calibration is not None:
@@ -71,7 +69,7 @@ class Sequence:
             files = files._replace(read_camera=read_camera, calibration=Path(calibration))
         if truth is not None:
             files = files._replace(read_poses=read_truth, poses=Path(truth))
-        self.frame_paths, self.doubts, self._others = files.frames, files.doubts, files.others
+        self.frame_paths, self._others = files.frames, files.others
         self.calibration_path = files.calibration
         self.times_path, self.poses_path = files.times, files.poses
         lens = files.read_camera(self.calibration_path)
@@ -84,7 +82,6 @@ class Sequence:
         # whether somebody said what they are
         self.has_times = self.times_path.exists() or fps is not None
         self.times = self._read_times(files.read_times, fps)
-        self.usual_interval = float(np.median(np.diff(self.times))) if len(self) > 1 else 0.0
         self.has_truth = truth is not None or (speed is None and self.poses_path.exists())
         if self.has_truth:
             times = self.times if self.has_times else None
@@ -249,10 +246,9 @@ class Sequence:
         """Where keypoints may lie in frame `index`, (height, width) uint8: 255, elsewhere 0.
 
         They lie neither in transparent parts, nor outside of what the camera saw if its distortion
-        is taken out, nor in the border (`without_border`), nor within BORDER_MARGIN pixels of
-        these. None: everywhere.
+        is taken out, nor within MARGIN pixels of these. None: everywhere.
         """
-        hidden = np.zeros(self.size, bool) if self.border is None else self.border.copy()
+        hidden = np.zeros(self.size, bool)
         if self._has_alpha:
             pixels = read_unchanged(self.frame_paths[index])
             if pixels.ndim == 3 and pixels.shape[2] == 4:
@@ -261,26 +257,13 @@ class Sequence:
             hidden |= self.undistorted(np.full(self.size, 255, np.uint8)) == 0
         if not hidden.any():
             return None
-        margin = np.ones([2 * BORDER_MARGIN + 1] * 2, np.uint8)
+        margin = np.ones([2 * MARGIN + 1] * 2, np.uint8)
         return 255 - cv2.dilate(hidden * np.uint8(255), margin)
 
     @cached_property
     def _has_alpha(self) -> bool:
         pixels = read_unchanged(self.frame_paths[0])
         return pixels.ndim == 3 and pixels.shape[2] == 4
-
-    def without_border(self) -> "Sequence":
-        """Copy without keypoints in parts that are black in all frames, nor close to them.
-
-        Undistortion leaves such borders. Raises InputError if there are none.
-        """
-        sample = np.unique(np.linspace(0, len(self) - 1, BORDER_SAMPLES).astype(int))
-        border = np.max([self.frame(index) for index in sample], axis=0) <= BLACK
-        if not border.any() or border.all():
-            raise InputError(f"{self.folder}: frames have no black border; do not leave it out")
-        bordered = copy(self)
-        bordered.border = border
-        return bordered
 
     def subset(self, count: int | None) -> "Sequence":
         """Copy of the sequence with its first `count` frames; None for all frames."""

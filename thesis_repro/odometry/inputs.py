@@ -2,18 +2,13 @@
 
 from typing import Any
 
-import cv2
 import numpy as np
 
-from thesis_repro.data.frames import say_once
-from thesis_repro.data.geometry import are_poses, centre_doubt, check_camera, is_camera_matrix
+from thesis_repro.data.geometry import are_poses, check_camera, is_camera_matrix
 from thesis_repro.errors import InputError
-from thesis_repro.odometry.settings import THESIS
-from thesis_repro.running import program
 
 MIN_CONTRAST = 4.0  # standard deviation in gray levels; real frames have more than 50
-MANY = 20  # keypoints from which on they tell what their coordinates are
-WEAKER = 2  # times, in the mean, are corners stronger where swapped coordinates are
+MANY = 20  # keypoints from which on they are in pixels, not in fractions
 EQUAL = "equal frame"  # flag of a frame that equals the one before
 
 
@@ -49,8 +44,6 @@ def gray_frame(
             "the odometry needs 8-bit gray, (height, width)"
         )
     check_camera("intrinsics", intrinsics, f"frame {number}", frame.shape)
-    if previous is None and (doubt := centre_doubt(intrinsics, frame.shape)):
-        say_once(f"intrinsics: {doubt}", warns=True)
     if previous is not None and frame.shape != previous.shape:
         raise InputError(
             f"frame {number}: shape {frame.shape}, earlier frames {previous.shape}; "
@@ -117,11 +110,11 @@ def allowed_pixels(mask: Any, number: int, frame: np.ndarray) -> np.ndarray | No
     return mask
 
 
-def keypoints(points: Any, frame: np.ndarray, detector: str, is_first: bool = False) -> np.ndarray:
+def keypoints(points: Any, frame: np.ndarray, detector: str) -> np.ndarray:
     """Return keypoints of a frame, float32 (N, 2), or raise InputError.
 
-    What lies outside of the frame cannot be (u, v). In the first frame, a warning says what is most
-    likely (v, u). detector: the name of what found them, for the messages.
+    What lies outside of the frame cannot be (u, v). detector: the name of what found them, for the
+    messages.
     """
     returned = f"{detector} returned"
     if getattr(points, "dtype", None) != np.float32 or np.shape(points)[1:] != (2,):
@@ -142,11 +135,6 @@ def keypoints(points: Any, frame: np.ndarray, detector: str, is_first: bool = Fa
         )
     if len(points) >= MANY and points.max() <= 1:
         raise InputError(f"{returned} fractions from 0 to 1; must be (u, v) in pixels")
-    if is_first and _may_be_swapped(points, frame):
-        program.log.warning(
-            f"{returned} keypoints on much weaker corners than with u and v swapped; u is the column, v "
-            "the row"
-        )
     return points
 
 
@@ -155,28 +143,3 @@ def described(value: Any) -> str:
     if isinstance(value, np.ndarray):
         return f"{value.dtype} {value.shape}"
     return type(value).__name__
-
-
-def _may_be_swapped(points: np.ndarray, frame: np.ndarray) -> bool:
-    """Whether keypoints (N, 2) lie on much weaker corners than with both coordinates swapped.
-
-    Only those can be compared that are inside the frame in both orders.
-    """
-    both = points[(points.max(axis=1) < min(frame.shape) - 1) & (points.min(axis=1) >= 0)]
-    if len(both) < MANY:
-        return False
-    columns, rows = np.rint(both).astype(int).T
-    strength = _corner_strength(frame)
-    return bool(strength[columns, rows].mean() > WEAKER * strength[rows, columns].mean())
-
-
-_latest: tuple[np.ndarray, np.ndarray] | None = None  # a frame and its strength
-
-
-def _corner_strength(frame: np.ndarray) -> np.ndarray:
-    """Corner strength of each pixel. That of the latest frame is kept, for runs that share it."""
-    global _latest
-    latest = _latest  # another thread may change it
-    if latest is None or latest[0] is not frame:
-        latest = _latest = frame, cv2.cornerMinEigenVal(frame, THESIS.block_size)
-    return latest[1]

@@ -246,7 +246,7 @@ class Odometry:
             with step.timed("detect"):
                 found = self.calls.detect(frame, self.settings, mask)
             name = f"frame {step.frame}: the detector"
-            detected = inputs.keypoints(found, frame, name, step.frame == 0)
+            detected = inputs.keypoints(found, frame, name)
             step.detected = len(detected)
             if len(detected):
                 points = detected
