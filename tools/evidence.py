@@ -80,7 +80,9 @@ def write(settings, folder):
             sequences, labels, few_folder, settings.jobs, few_keypoints.REPETITIONS
         ),
         "every second frame": lambda: runs_of_every_second(settings, sequences, labels),
-        "their times": lambda: few_keypoints.time_steps(sequences[0], labels, few_folder),
+        "their times": lambda: timing.times(
+            settings, "few_keypoints", lambda: few_keypoints.time_steps(sequences[0], labels)
+        ),
         "refined estimator, every width": lambda: runs_of_widths(settings, sequences, labels),
     }
     made = []
@@ -90,7 +92,6 @@ def write(settings, folder):
         made.append(make())
         print(f"{name}: done in {time.monotonic() - started:.0f} s", flush=True)
     few_runs, second_runs, times, of_widths = made
-    times = timing.recorded(settings, "few_keypoints", times)
     few = few_keypoints.ratios_to_all(few_runs)
     streets = _streets(sequences)
     provenance.sweep(folder)

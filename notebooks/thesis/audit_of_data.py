@@ -125,7 +125,7 @@ def of_earlier_notebooks(settings: Settings, count: int) -> list[dict[str, Any]]
 
 def of_times(settings: Settings) -> list[dict[str, Any]]:
     """Return rows 16 and 47, from the times that notebook 08 shows."""
-    seconds, stages = (timing.recorded(settings, name) for name in ("seconds", "budget"))
+    seconds, stages = (timing.times(settings, name) for name in ("seconds", "budget"))
     of_each = {name: timing.time_savings(rows) for name, rows in seconds.groupby("sequence")}
     timed_on: dict[str, Any] = {"data": timing.told(seconds)}
     measurements = []

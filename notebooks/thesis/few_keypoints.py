@@ -28,7 +28,6 @@ from keypoint_study.sources import Source
 from keypoint_study.verdicts import verdict_on_few
 from thesis_repro import odometry
 from thesis_repro.data.sequence import Sequence
-from thesis_repro.running import provenance
 
 COMPARED = {name: jobs.ESTIMATOR_TITLES[name] for name in ("thesis", "refined")}  # of the verdict
 NUMBERS = (50, 100, 200, 400, 800)
@@ -111,17 +110,13 @@ def run_few(
     )[list(COLUMNS)]
 
 
-def time_steps(sequence: Sequence, labels: Path, folder: Path, frames: int = 40) -> pd.DataFrame:
+def time_steps(sequence: Sequence, labels: Path, frames: int = 40) -> pd.DataFrame:
     """Return the CPU time (milliseconds) of a frame for each choice: its fastest of some runs.
 
     With the thesis's estimator, one thread and the mask made from its label map, without the
     network. The choices take turns, so that other programs slow all of them alike. Random choices
     are left out, because they are drawn from all detected keypoints.
-    folder: that of `run_few`, which is called before. Times in it are not measured again.
     """
-    file = folder / sequence.name / "milliseconds.csv"
-    if file.is_file():
-        return pd.read_csv(file)
     cv2.setNumThreads(1)
     excerpt = sequence.subset(frames)
     timed = {key: run for key, run in choices(excerpt, labels).items() if key[0] != "random"}
@@ -132,9 +127,7 @@ def time_steps(sequence: Sequence, labels: Path, folder: Path, frames: int = 40)
         least[key] = min(least[key], process_time() - start)
     # whole milliseconds: repeated measurements differ by more than one
     times = (1000 * pd.Series(least) / len(excerpt)).round().astype(int)
-    times = times.rename_axis(["choice", "number"]).rename("milliseconds").reset_index()
-    provenance.write_table(file, times)
-    return times
+    return times.rename_axis(["choice", "number"]).rename("milliseconds").reset_index()
 
 
 def ratios_to_all(runs: pd.DataFrame) -> pd.DataFrame:

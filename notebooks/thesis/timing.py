@@ -6,12 +6,12 @@ image at a time, all cores.
 
 Figures and tables in git have the times of git, which `make timings` measures anew: those of the
 default run in figures/timings, those of the evidence in figures/kitti_excerpts/timings. So a run on
-another machine changes no sentence. Other runs have their own.
+another machine changes no sentence. Other frames are timed once, in the folder of their figures.
 """
 
 import platform
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from datetime import date
 from importlib.metadata import version
@@ -36,7 +36,7 @@ from thesis_repro.data.cityscapes import resize_bilinear
 from thesis_repro.data.sequence import Sequence
 from thesis_repro.masks import folders
 from thesis_repro.odometry.runs import Masks
-from thesis_repro.running.files import progress, write_text
+from thesis_repro.running.files import needed, progress, write_text
 
 TURNS = 2  # of each run, of which the fastest counts
 FRAMES = 20  # on which the stages are timed
@@ -88,8 +88,6 @@ def time_savings(seconds: pd.DataFrame) -> pd.DataFrame:
     It is negative if time is saved. There is one column for each number of threads ("1 thread", "2
     threads"). seconds: of `seconds_of_widths`; they are added over the sequences.
     """
-    if "threads" not in seconds:  # recorded before 1.1
-        seconds = seconds.assign(threads=1)
     columns = {}
     for threads, rows in seconds.groupby("threads"):
         baseline = rows.loc[rows["method"] == "baseline", "seconds"].sum()
@@ -206,29 +204,33 @@ def table_of_stages(stages: pd.DataFrame) -> pd.DataFrame:
     return budget.rename_axis("stage").rename_axis(None, axis=1).reset_index()
 
 
-def folder_in_git(settings: Settings) -> Path | None:
-    """Return the folder of the times in git that a run's figures show; None: they are its own."""
+def folder(settings: Settings) -> Path:
+    """Return the folder of the times that a run's figures show: in git for figures in git."""
     if settings.figures_in_git:
         return ROOT / "figures" / "timings"
     if excerpts.is_evidence(settings):
         return excerpts.FOLDER / "timings"
-    return None
+    return settings.figures / "timings"
 
 
-def recorded(settings: Settings, name: str, measured: pd.DataFrame | None = None) -> pd.DataFrame:
-    """Return the times that are shown, and what `told` tells of them.
+def times(
+    settings: Settings, name: str, measure: Callable[[], pd.DataFrame] | None = None
+) -> pd.DataFrame:
+    """Return the times that a run's figures show, and what `told` tells of them.
 
-    They are those in git, if the figures are those in git and there are any; otherwise those
-    measured now, which are kept in a file, or those of this file if none are given.
+    measure: measures them, if the frames of the run were never timed; then they are written.
     """
-    in_git = folder_in_git(settings)
-    folder = settings.figures if in_git is None else settings.build
-    path = folder / "timings" / f"{name}.csv"
-    if measured is not None:
-        write_text(path, measured.assign(**circumstances(settings)).to_csv(index=False))
-    if in_git is not None and (in_git / path.name).is_file():
-        path = in_git / path.name
-    return pd.read_csv(path, dtype={"sequence": str})
+    path = folder(settings) / f"{name}.csv"
+    if measure and not path.is_file():
+        write(settings, name, measure())
+    return pd.read_csv(needed(path, "08_results"), dtype={"sequence": str})
+
+
+def write(settings: Settings, name: str, measured: pd.DataFrame) -> None:
+    """Write times where a run's figures find them, with where, when and on what they were taken."""
+    table = measured.assign(**circumstances(settings))
+    text = table.to_csv(index=False, lineterminator="\n", float_format="%.6g")
+    write_text(folder(settings) / f"{name}.csv", text)
 
 
 def circumstances(settings: Settings) -> dict[str, str]:
@@ -246,13 +248,12 @@ def circumstances(settings: Settings) -> dict[str, str]:
 
 
 def told(times: pd.DataFrame) -> str:
-    """Return one line on where, when and on what times were measured. times: of `recorded`."""
-    columns = ("processor", "date", "version", "network")
-    first = {name: times[name].iloc[0] for name in columns if name in times}
-    words = [str(first["processor"])]
-    if "date" in first:  # not recorded before 1.1
-        words += [f"{first['date']}, version {first['version']}", f"network: {first['network']}"]
-    return f"timed on {'; '.join(words)}"
+    """Return one line on where, when and on what times were measured. times: of `times`."""
+    first = times.iloc[0]
+    return (
+        f"timed on {first['processor']}; {first['date']}, version {first['version']}; "
+        f"network: {first['network']}"
+    )
 
 
 def processor() -> str:

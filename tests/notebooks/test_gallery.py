@@ -70,7 +70,7 @@ def test_each_artefact_is_saved_by_a_notebook_and_has_files_in_git():
 
 
 def test_the_gallery_in_git_is_made_from_what_is_in_git():
-    """After a change of a caption or a table: `make page`."""
+    """After a change of a caption or a table: `tools/write_texts.py`."""
     in_git = read_settings({})
     text = (ROOT / "figures" / "README.md").read_text()
     assert text == gallery.text(in_git)
@@ -105,7 +105,8 @@ def test_numbers_of_the_run_stand_beside_the_thesiss(run):
         "figure_4_01.csv": "epoch,val_loss\n1,0.8\n2,0.9\n",
         "table_4_1.csv": "sequence,mean keypoints\n00,500\n01,300\n",
         "timings/seconds.csv": (
-            "sequence,method,dilation_width,seconds\n00,baseline,,10\n00,masked,1,8\n00,masked,2,11\n"
+            "sequence,method,dilation_width,threads,seconds\n"
+            "00,baseline,,1,10\n00,masked,1,1,8\n00,masked,2,1,11\n"
         ),
     }
     for name, text in files.items():

@@ -5,8 +5,9 @@ import pytest
 
 from keypoint_study.sources import Source
 from thesis import excerpts, timing
-from thesis.settings import ROOT, read_settings
+from thesis.settings import read_settings
 from thesis_repro.data.sequence import Sequence
+from thesis_repro.errors import InputError
 
 MEASURED = pd.DataFrame({"sequence": ["00"], "seconds": [0.25]})
 
@@ -18,36 +19,30 @@ def settings(tmp_path):
     return read_settings({f"THESIS_REPRO_{name}": str(value) for name, value in names.items()})
 
 
-def test_a_run_shows_its_own_times_with_machine_date_version_and_sizes(settings):
-    table = timing.recorded(settings, "seconds", MEASURED)
+def test_frames_are_timed_once_with_machine_date_version_and_sizes(settings):
+    with pytest.raises(InputError, match="seconds.csv: .*08_results"):
+        timing.times(settings, "seconds")
+    table = timing.times(settings, "seconds", lambda: MEASURED)
     assert table["seconds"].tolist() == [0.25] and table["sequence"].tolist() == ["00"]
-    told = timing.told(table)
     for name, text in timing.circumstances(settings).items():
-        assert table[name].tolist() == [text] and text in told
-    assert timing.recorded(settings, "seconds").equals(table)  # read again
+        assert table[name].tolist() == [text] and text in timing.told(table)
+    assert timing.times(settings, "seconds", lambda: MEASURED.assign(seconds=1)).equals(table)
 
 
 @pytest.mark.parametrize("is_evidence", [False, True])
 def test_what_a_machine_measures_changes_no_figure_in_git(monkeypatch, tmp_path, is_evidence):
     settings = read_settings({"THESIS_REPRO_BUILD": str(tmp_path / "build")})
-    folder = ROOT / "figures/timings"
     if is_evidence:
-        settings = read_settings(
-            {"THESIS_REPRO_BUILD": str(tmp_path / "build"), "THESIS_REPRO_PROFILE": "thesis"}
-        )
+        settings = read_settings({"THESIS_REPRO_PROFILE": "thesis"})
         monkeypatch.setattr(excerpts, "is_evidence", lambda _: True)
-        monkeypatch.setattr(excerpts, "FOLDER", tmp_path / "evidence")
-        folder = tmp_path / "evidence/timings"
-        folder.mkdir(parents=True)
-        MEASURED.assign(seconds=7.0, processor="another").to_csv(folder / "seconds.csv")
-    before = (folder / "seconds.csv").read_bytes()
-    shown = timing.recorded(settings, "seconds", MEASURED)
+        monkeypatch.setattr(excerpts, "FOLDER", tmp_path)
+        (tmp_path / "timings").mkdir()
+        MEASURED.assign(seconds=7.0).to_csv(tmp_path / "timings/seconds.csv")
+    path = timing.folder(settings) / "seconds.csv"
+    before = path.read_bytes()
+    shown = timing.times(settings, "seconds", lambda: MEASURED)
     assert len(shown) and 0.25 not in shown["seconds"].tolist()
-    assert (folder / "seconds.csv").read_bytes() == before
-    own = pd.read_csv(settings.build / "timings/seconds.csv")
-    assert own["seconds"].tolist() == [0.25]
-    # what nobody has recorded is this machine's
-    assert timing.recorded(settings, "more", MEASURED)["seconds"].tolist() == [0.25]
+    assert path.read_bytes() == before
 
 
 def test_widths_are_timed_on_one_thread_and_on_all_cores(small_world, small_labels, monkeypatch):
