@@ -4,13 +4,13 @@ SHELL := /bin/bash
 .DEFAULT_GOAL := help
 MAKEFLAGS += --no-print-directory
 BIN := .venv/bin
-# A setting on the command line, or in the environment, reaches Python as a THESIS_REPRO_ variable. Python names a misspelled
-# one of the command line; of the environment, only these are taken.
+# A setting reaches Python as a THESIS_REPRO_ variable: all that stand on the command line, of which Python names a misspelled
+# one, and these of the environment.
 SETTINGS := KITTI CITYSCAPES KITTI_SEMANTIC PROFILE IMAGE_SIZE BASE_FILTERS BATCH_SIZE EPOCHS FRAMES WIDTHS REPETITIONS JOBS \
             BUILD FIGURES DASK_SCHEDULER
-MINE := PYTHON GPU CAMVID PSEUDO RAW LISTEN RUN LAST
+OF_MAKE := PYTHON GPU RAW LISTEN RUN
 of = $(foreach name,$(2),$(if $(filter $(1),$(origin $(name))),$(name)))
-given := $(filter-out $(MINE) MAKE% -%,$(sort $(call of,command line,$(.VARIABLES))))
+given := $(filter-out $(OF_MAKE) MAKE% -%,$(sort $(call of,command line,$(.VARIABLES))))
 around := $(foreach name,$(call of,environment,$(SETTINGS)),$(if $(THESIS_REPRO_$(name)),,$(name)))
 $(foreach name,$(given) $(around),$(eval export THESIS_REPRO_$(name) := $$($(name))))
 ifneq ($(around),)
@@ -29,26 +29,24 @@ export OMP_NUM_THREADS := $(firstword $(subst $(comma), ,$(OMP_NUM_THREADS)))
 endif
 unexport PYTHONHOME PYTHONDONTWRITEBYTECODE PYTHONSTARTUP JUPYTER_PATH CDPATH TF_USE_LEGACY_KERAS XLA_FLAGS TF_XLA_FLAGS
 
-.PHONY: help setup figures book notebooks page excerpts evidence timings pictures test torture lint lab bench weights pins clean check-data
+.PHONY: help setup figures notebooks test lint lab book check-data excerpts evidence timings torture bench clean
 help:
 	@echo "make figures     write every table and figure to figures/, from embedded data, or from KITTI=/path CITYSCAPES=/path"
 	@echo "                 (KITTI_SEMANTIC=/path: also test the label maps); size: PROFILE=smoke|lab|demo|thesis, or single:"
 	@echo "                 IMAGE_SIZE BASE_FILTERS BATCH_SIZE EPOCHS FRAMES=N|all WIDTHS=5,10|1-15 REPETITIONS; processes: JOBS"
-	@echo "make test, lint  run the tests, and every notebook with PROFILE=smoke; check style (Ruff), types (mypy), imports"
-	@echo "make torture     run the tests of kills, faults, bad input, and of the oldest and newest packages (some minutes)"
 	@echo "make lab         open copies of the notebooks in JupyterLab with PROFILE=lab (up to two minutes each);"
 	@echo "                 in a container LISTEN=0.0.0.0"
 	@echo "make check-data  check the folders KITTI=/path CITYSCAPES=/path KITTI_SEMANTIC=/path"
+	@echo "make test, lint  run the tests, and every notebook with PROFILE=smoke; check style (Ruff), types (mypy), imports"
+	@echo "make torture     run the tests of kills, faults, bad input, and of the oldest and newest packages (some minutes)"
+	@echo "make book        after make figures: write its book into build/; a warning is an error"
 	@echo "make excerpts    cut the frames of the evidence from KITTI=/path RAW=/path, and check them, into build/excerpts"
 	@echo "make evidence    make figures PROFILE=thesis from KITTI=build/excerpts, and keep what shows no frame; from other"
 	@echo "                 frames, elsewhere (whole sequences take hours; FRAMES=00:0-129,04:0-37 takes parts of sequences)"
-	@echo "make timings     after make figures, or make evidence KITTI=build/excerpts: measure the times that their figures show"
+	@echo "make timings     after make figures, or make evidence KITTI=build/excerpts: measure the times of their figures anew"
 	@echo "make bench       measure the relative cost of odometry and network (KITTI=/path), into build/bench.json"
-	@echo "make pictures    draw the pictures of real streets from KITTI=build/excerpts"
-	@echo "make weights     train the shipped model anew into build/shipped, CAMVID=/path KITTI_SEMANTIC=/path PSEUDO=/path"
-	@echo "make book        after make figures: write its book into build/; a warning is an error"
-	@echo "make page, pins  write gallery, README and docs/answer.md anew from the tables in git; resolve the pins of environment.txt anew"
-	@echo "make setup       install the pinned packages into .venv (GPU=1: and CUDA); make clean: delete .venv and all results"
+	@echo "make setup       install the pinned packages into .venv (GPU=1: and CUDA)"
+	@echo "make clean       delete .venv and all results"
 
 # uv takes a third of pip's time, but ignores pip's settings, so pip follows if uv reaches no index. The options in PIP
 # undo settings of pip that would install elsewhere.
@@ -56,10 +54,10 @@ PIP = $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-user
 install = $(BIN)/uv pip install --quiet --system-certs --python $(BIN)/python --no-deps $(1) || \
           { echo "uv failed, so pip is used" && $(PIP) --no-deps --no-compile $(1); }
 setup: .venv/ready $(if $(filter 1,$(GPU)),.venv/ready-gpu)
-	@$(BIN)/thesis-repro --version >/dev/null && $(BIN)/python tools/installed.py || { \
+	@$(BIN)/thesis-repro --version >/dev/null && $(BIN)/python tools/environment.py --check || { \
 	  echo "error: .venv no longer works: was it moved or copied, or Python upgraded? Run make clean, then make setup" >&2; exit 1; }
 .venv/ready: environment.txt pyproject.toml
-	@python=$$($(or $(PYTHON),$$(command -v python3 python3.13 python3.12 python3.11 | head -n 1)) tools/can_install.py \
+	@python=$$($(or $(PYTHON),$$(command -v python3 python3.13 python3.12 python3.11 | head -n 1)) tools/environment.py \
 	  $(if $(PYTHON),,--search)) && echo "installing the pinned packages into .venv (2.4 GB)" && "$$python" -m venv .venv
 	@$(PIP) $$(grep -o '^uv==[0-9.]*' environment.txt)
 	@$(call install,-r environment.txt)
@@ -74,9 +72,6 @@ figures: setup
 	@$(BIN)/python -m thesis.run
 book: setup
 	@$(BIN)/python -m thesis.book
-page: setup
-	@$(BIN)/python tools/write_texts.py
-	@$(BIN)/python -m thesis.gallery
 
 # `thesis.run` deletes what is out of date, writes into needs.mk which notebook needs which, and calls this with the folder of
 # the run. A notebook that exists is done, whatever its date; nbconvert writes under another name. Its kernel has nothing to do
@@ -127,13 +122,6 @@ evidence: setup
 	@$(BIN)/python tools/write_texts.py
 timings: setup
 	@$(if $(KITTI),THESIS_REPRO_PROFILE=thesis) $(BIN)/python tools/timings.py
-pictures: setup
-	@$(BIN)/python tools/pictures.py
-weights: setup
-	@$(BIN)/python tools/train_shipped.py "$(CAMVID)" "$(KITTI_SEMANTIC)" "$(PSEUDO)" build/shipped
-# Not `setup`, which would install what is not resolved yet.
-pins: $(if $(wildcard $(BIN)/uv),,setup)
-	@$(BIN)/python tools/pins.py
 clean:
 	rm -rf .venv build *.egg-info .pytest_cache .ruff_cache .mypy_cache
 	find figures -mindepth 1 -maxdepth 1 -type d -not -name kitti_excerpts -not -name camvid -not -name timings -exec rm -rf {} +

@@ -1,7 +1,7 @@
 """Draw the pictures of real streets in figures/kitti_excerpts/pictures.
 
-`make pictures KITTI=build/excerpts` takes the frames of the evidence (`make excerpts`) and writes
-nothing else. The model in the package makes the label maps, as for the evidence.
+It takes the frames of the evidence, build/excerpts (`make excerpts`), and writes nothing else. The
+model in the package makes the label maps, as for the evidence.
 """
 
 import tempfile
@@ -12,7 +12,7 @@ import numpy as np
 import thesis_repro as tr
 from keypoint_study.report import style
 from thesis import excerpts, frames
-from thesis.settings import read_settings
+from thesis.settings import ROOT
 from thesis_repro.data.cityscapes import read_label_map
 from thesis_repro.data.sequence import Sequence
 from thesis_repro.errors import InputError
@@ -105,7 +105,7 @@ def tracks_and_outliers(sequence):
 @style.applied()
 def main():
     """Write the pictures."""
-    root = read_settings().kitti
+    root = ROOT / "build" / "excerpts"
     streets = {name: opened(root, name) for name in (STREET, FAILS, TRACKED)}
     with tempfile.TemporaryDirectory() as folder:
         labels = {}

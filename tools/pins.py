@@ -1,4 +1,4 @@
-"""Resolve environment.txt anew for Python 3.11 to 3.13 and every machine: `make pins`.
+"""Resolve environment.txt anew for Python 3.11 to 3.13 and every machine.
 
 Its first part names the packages that the project calls itself: change a version there. The second
 part, what those need, is rewritten. Versions that still fit stay.

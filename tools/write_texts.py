@@ -1,7 +1,8 @@
-"""Write README.md and docs from docs/templates, with numbers from the tables in git.
+"""Write README.md, docs and the gallery from templates, with numbers from the tables in git.
 
-`make page` runs it, and `tools/evidence.py` at its end. A template asks the functions below for the
-row of a table, and writes its numbers. Its only conditions are the outcomes of verdicts.
+After a change of a template, an option or a caption; `make evidence` runs it at its end. A template
+asks the functions below for the row of a table, and writes its numbers. Its only conditions are the
+outcomes of verdicts.
 """
 
 import re
@@ -12,8 +13,8 @@ import pandas as pd
 
 from keypoint_study import comparisons, ratios, verdicts
 from keypoint_study.report import texts
-from thesis import claims, equal_number, few_keypoints
-from thesis.settings import ROOT
+from thesis import claims, equal_number, few_keypoints, gallery
+from thesis.settings import ROOT, read_settings
 from thesis_repro.command import cli
 from thesis_repro.command.options import build_parser
 from thesis_repro.running import program
@@ -260,6 +261,7 @@ def main() -> None:
     write_tables()
     for template, path in WRITTEN.items():
         write_text(path, render(template))
+    gallery.write(read_settings({}))
 
 
 texts.LOADER.searchpath.append(str(TEMPLATES))

@@ -13,8 +13,7 @@ import yaml
 from packaging.requirements import Requirement
 from trials import PACKAGES, copy_project, refused, run, snapshot, succeed
 
-import can_install
-import installed as installed_packages
+import environment
 from thesis.settings import ROOT
 from thesis_repro.running import provenance
 
@@ -169,9 +168,9 @@ def test_an_environment_that_no_longer_works_is_told(checkout, tmp_path):
         (checkout / ".venv/bin" / name).chmod(0o755)
     failed = run(["make", "lint"], checkout)
     assert failed.returncode == 2 and "make clean" in failed.stderr
-    assert installed_packages.missing(
-        "numpy==1\nno-such==2  # x\n\n# What those need:\nother==3"
-    ) == ["no-such"]
+    assert environment.missing("numpy==1\nno-such==2  # x\n\n# What those need:\nother==3") == [
+        "no-such"
+    ]
 
 
 def test_two_runs_in_one_folder_are_refused(checkout):
@@ -195,17 +194,17 @@ def test_two_runs_in_one_folder_are_refused(checkout):
     ],
 )
 def test_what_cannot_be_installed_is_said_with_its_cure(version, system, machine, cure):
-    line = can_install.reason(version, system, machine)
+    line = environment.reason(version, system, machine)
     assert cure in line and bool(line) == bool(cure) and "\n" not in line
 
 
-def as_310(search, path, monkeypatch):
+def as_310(options, path, monkeypatch):
     """Look for a Python as Python 3.10 on Linux would, with a PATH and no package index."""
-    monkeypatch.setattr(can_install.sys, "version_info", (3, 10, 13))
-    monkeypatch.setattr(can_install.platform, "system", lambda: "Linux")
+    monkeypatch.setattr(environment.sys, "version_info", (3, 10, 13))
+    monkeypatch.setattr(environment.platform, "system", lambda: "Linux")
     monkeypatch.setenv("PATH", os.pathsep.join(map(str, path)))
     monkeypatch.setenv("PIP_NO_INDEX", "1")
-    can_install.main(search)
+    environment.main(options)
 
 
 def test_another_python_on_the_path_is_taken_if_python3_does_not_fit(tmp_path, monkeypatch, capsys):
@@ -216,12 +215,12 @@ def test_another_python_on_the_path_is_taken_if_python3_does_not_fit(tmp_path, m
     shim.chmod(0o755)
     folders = tmp_path / "shims", tmp_path / "real"
     with pytest.raises(SystemExit, match="PYTHON=python3.12"):
-        as_310(True, folders, monkeypatch)
+        as_310(["--search"], folders, monkeypatch)
     (tmp_path / "real/python3.11").symlink_to(Path(sys.executable).resolve())
     with pytest.raises(SystemExit, match="PYTHON=python3.12"):
-        as_310(False, folders, monkeypatch)
+        as_310([], folders, monkeypatch)
     capsys.readouterr()
-    as_310(True, folders, monkeypatch)
+    as_310(["--search"], folders, monkeypatch)
     out, err = capsys.readouterr()
     assert out == f"{tmp_path}/real/python3.11\n"
     assert err.count("\n") == 1 and "3.10" in err and out.strip() in err
@@ -229,7 +228,7 @@ def test_another_python_on_the_path_is_taken_if_python3_does_not_fit(tmp_path, m
 
 def test_nothing_is_installed_if_the_python_does_not_fit(checkout, tmp_path):
     (checkout / ".venv").unlink()
-    python = tmp_path / "python3.10"  # says so in place of tools/can_install.py
+    python = tmp_path / "python3.10"  # says so in place of tools/environment.py
     python.write_text("#!/bin/sh\necho error: cure >&2\nexit 1\n")
     python.chmod(0o755)
     failed = run(["make", "setup", f"PYTHON={python}"], checkout)
