@@ -28,10 +28,6 @@ from trials import (
 )
 
 
-def long(*case):
-    return pytest.param(*case, marks=pytest.mark.torture)  # not in `make test`
-
-
 @pytest.fixture
 def disk(tmp_path):
     """Give disk(kilobytes, "ro" or "rw"), which makes or resizes a small disk."""
@@ -56,7 +52,7 @@ def disk(tmp_path):
     "name, kilobytes",
     [
         ("path", 0),
-        long("study", 40),
+        pytest.param("study", 40, marks=pytest.mark.torture),  # not in `make test`
     ],
 )
 def test_a_read_only_disk_and_a_full_one(words, disk, tmp_path, name, kilobytes):
@@ -122,18 +118,8 @@ KILL, CTRL_C, TERM = signal.SIGKILL, signal.SIGINT, signal.SIGTERM
 
 
 @pytest.mark.torture
-@pytest.mark.parametrize(
-    "name, signals",
-    [
-        ("study", [KILL] * 5),
-        ("study", [CTRL_C] * 5),
-        ("study", [TERM] * 5),
-        ("figures", [KILL, CTRL_C, TERM, KILL, CTRL_C]),
-    ],
-)
-def test_a_command_that_is_stopped_at_five_moments_ends_in_the_same_bytes(
-    words, tmp_path, name, signals
-):
+@pytest.mark.parametrize("name", ["study", "figures"])
+def test_a_command_that_is_stopped_at_five_moments_ends_in_the_same_bytes(words, tmp_path, name):
     """Each run goes on where the one before was stopped, and has more time than that one."""
     out = tmp_path / "out"
     shown = out / "figures" if name == "figures" else out
@@ -142,7 +128,7 @@ def test_a_command_that_is_stopped_at_five_moments_ends_in_the_same_bytes(
     assert ended.returncode == 0, ended.stderr
     seconds, expected = time.monotonic() - started, contents(shown)
     shutil.rmtree(out)
-    for place, number in enumerate(signals, 1):
+    for place, number in enumerate((KILL, CTRL_C, TERM, KILL, CTRL_C), 1):
         process = begin(words(name), tmp_path, number)
         with suppress(subprocess.TimeoutExpired):
             process.wait(place / 10 * seconds)
