@@ -184,7 +184,6 @@ def test_without_ground_truth_there_are_no_errors(
 def test_public_names():
     assert dir(tr) == sorted([*tr.__all__, "__version__"])
     assert all(hasattr(tr, name) for name in tr.__all__) and not hasattr(tr, "mistyped")
-    assert {*DETECTORS} <= {*tr.__all__}
     assert tr.__version__ == metadata.version("thesis-repro")
     assert (
         tr.OdometrySettings() == tr.THESIS
@@ -269,8 +268,13 @@ def test_a_new_detector_is_a_name_and_an_option(tiny_kitti, monkeypatch, capsys)
     monkeypatch.setitem(DETECTORS, "mine", mine)
     assert tr.mine is mine
     where = ["--kitti", tiny_kitti, "--sequence", "00", "--json"]
-    assert run("odometry", *where, "--detector", "mine") == 0
-    assert json.loads(capsys.readouterr().out)["mean_keypoints"] == 7
+    for name, count in {"mine": 7, "spread=5": 5}.items():
+        assert run("odometry", *where, "--detector", name) == 0
+        assert json.loads(capsys.readouterr().out)["mean_keypoints"] == count
+    for wrong in ("hers", "spread", "mine=5", "spread=0"):
+        with pytest.raises(SystemExit):
+            run("odometry", *where, "--detector", wrong)
+        assert "--detector" in capsys.readouterr().err
     with pytest.raises(SystemExit):
         run("odometry", "--help")
     assert "mine: Seven points, 50 % of which" in " ".join(capsys.readouterr().out.split())

@@ -4,7 +4,6 @@ import json
 import pickle
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from inspect import isfunction
 
 import cv2
 import numpy as np
@@ -202,42 +201,66 @@ def test_a_filled_mask_leaves_no_field_empty(drive):
     assert nearest_neighbours(filled).min() >= 3
 
 
-SQUARES = np.array([(67, 117), (157, 57), (257, 67), (407, 107)])  # their centres, (u, v)
+SQUARES = {(67, 117): 130, (157, 57): 90, (257, 67): 60, (407, 107): 40}  # centre, contrast
+FEW = 30  # keypoints; noise has more corners
+ON_PURPOSE = {"filled": "mask", "orb": "order"}  # fills the frame; lists one scale after another
 
 
-def assert_on_squares(detector):
+def found(detector, frame, mask=None):
+    """At most FEW keypoints of a detector, or of one with a number."""
+    settings = replace(THESIS, max_keypoints=FEW)
+    made = detector(FEW) if isinstance(detector, type) else detector
+    return inputs.keypoints(made(frame, settings, mask), frame, "detector")
+
+
+def assert_finds_corners(detector, name):
     """Squares of 14 pixels in a wide frame have corners; nothing else has."""
     frame = np.full((160, 480), 90, np.uint8)
-    for u, v in SQUARES:
-        frame[v - 7 : v + 7, u - 7 : u + 7] = 220
+    for (u, v), contrast in SQUARES.items():
+        frame[v - 7 : v + 7, u - 7 : u + 7] += np.uint8(contrast)
     frame = cv2.GaussianBlur(frame, (0, 0), 1)  # FAST finds nothing on sharp ones
-    points = inputs.keypoints(detector(frame, THESIS, None), frame, "detector")
-    distances = np.abs(points[:, None] - SQUARES).max(axis=2)
-    assert (distances.min(axis=0) < 14).all() and (distances.min(axis=1) < 14).all()
+    points = found(detector, frame)
+    distances = np.abs(points[:, None] - list(SQUARES)).max(axis=2)
+    assert len(points) and (distances.min(axis=1) < 14).all()
+    noise = np.random.default_rng(0).integers(0, 256, frame.shape, np.uint8)
+    assert 0.8 * FEW < len(found(detector, cv2.GaussianBlur(noise, (0, 0), 2))) <= FEW
+    if ON_PURPOSE.get(name) != "order":
+        contrasts = np.array(list(SQUARES.values()))[distances.argmin(axis=1)]
+        assert (np.diff(contrasts) <= 0).all() and contrasts[0] == 130  # the strongest first
+    mask = np.zeros(frame.shape, np.uint8)
+    mask[:, 300:] = 255
+    if ON_PURPOSE.get(name) != "mask":
+        inside = found(detector, frame, mask)
+        assert len(inside) and (inside[:, 0] > 299.5).all()
 
 
 @pytest.mark.parametrize("name", [*keypoints.DETECTORS, "shi-tomasi"])
-def test_each_detector_finds_corners_in_columns_and_rows(name):
+def test_each_detector_finds_the_strongest_corners_within_limit_and_mask(drive, name):
     detector = keypoints.DETECTORS.get(name, detect)
-    if isinstance(detector, type):
-        detector = detector(16)
-    assert_on_squares(detector)
+    assert_finds_corners(detector, name)
+    if not isinstance(detector, type):
+        assert len(detector(drive.frame(0), replace(THESIS, max_keypoints=0))) > 2000
+
+
+@pytest.mark.parametrize("number", [False, True])
+@pytest.mark.parametrize("mistake", ["mask", "one more", "order", "swapped"])
+def test_a_detector_with_a_mistake_is_found(mistake, number):
+    def wrong(frame, settings, mask=None):
+        more = settings.max_keypoints + (mistake == "one more")
+        mask = None if mistake == "mask" else mask
+        points = detect(frame, replace(settings, max_keypoints=more), mask)
+        swapped = points[:, ::-1] if mistake == "swapped" else points
+        return swapped[::-1] if mistake == "order" else swapped
+
+    class WithNumber:
+        def __init__(self, number):
+            self.number = number
+
+        def __call__(self, frame, settings, mask=None):
+            return wrong(frame, replace(settings, max_keypoints=self.number), mask)
+
     with pytest.raises((AssertionError, InputError)):
-        assert_on_squares(lambda *arguments: detector(*arguments)[:, ::-1])
-
-
-WITHOUT_NUMBER = [detect, *(each for each in keypoints.DETECTORS.values() if isfunction(each))]
-
-
-@pytest.mark.parametrize("find", WITHOUT_NUMBER, ids=lambda find: find.__name__)
-def test_each_detector_keeps_to_limit_and_mask(drive, find):
-    frame = drive.frame(0)
-    assert len(find(frame, replace(THESIS, max_keypoints=0))) > 2000
-    assert 0 < len(find(frame, replace(THESIS, max_keypoints=50))) <= 50
-    mask = np.zeros(frame.shape, np.uint8)
-    mask[:, :200] = 255
-    points = find(frame, THESIS, mask)
-    assert len(points) and (points[:, 0] < 200.5).all()
+        assert_finds_corners(WithNumber if number else wrong, "mine")
 
 
 def test_keypoints_that_cannot_be_pixels_are_refused(drive):

@@ -261,9 +261,9 @@ def _text(record: dict[str, Any], sequence: Any, speed: float | None) -> str:
 
 def _detector(options: Any) -> Any:
     """The detector that --detector, --spread and --fill choose; None for the thesis's."""
-    from thesis_repro.odometry.keypoints import DETECTORS, filled, spread
+    from thesis_repro.odometry.keypoints import filled, spread
 
-    detector = DETECTORS.get(vars(options).get("detector"))  # none for the thesis's
+    detector = vars(options).get("detector")
     if options.spread:
         if detector or vars(options).get("max_keypoints", 2000) != 2000:
             raise InputError("--spread N: goes without --max-keypoints and --detector")

@@ -63,16 +63,30 @@ def _ids() -> dict[str, Any]:
 def _detector() -> dict[str, Any]:
     from thesis_repro.odometry.keypoints import DETECTORS
 
-    detectors = {
-        name: f"{name}: {detector.__doc__}".splitlines()[0].rstrip(".").replace("%", "%%")
-        for name, detector in DETECTORS.items()
-        if not isinstance(detector, type)  # it needs a number
-    }
+    words = []
+    for name, detector in DETECTORS.items():
+        shown = f"{name}=N" if isinstance(detector, type) else name
+        first_line = (detector.__doc__ or "").splitlines()[0].rstrip(".").replace("%", "%%")
+        words.append(f"{shown}: {first_line}")
     return dict(
-        choices=["shi-tomasi", *detectors],
+        type=detector_of,
+        metavar="NAME[=N]",
         default="shi-tomasi",
-        help=f"what finds keypoints: {'; '.join(detectors.values())} (shi-tomasi)",
+        help=f"what finds keypoints: {'; '.join(words)} (shi-tomasi)",
     )
+
+
+def detector_of(text: str) -> Callable | None:
+    """Return the detector that a text names, such as "orb" or "spread=200"; None: the thesis's."""
+    from thesis_repro.odometry.keypoints import DETECTORS
+
+    name, equals, number = text.partition("=")
+    if text == "shi-tomasi":
+        return None
+    if name not in DETECTORS or isinstance(DETECTORS[name], type) != bool(equals):
+        known = ", ".join(["shi-tomasi", *DETECTORS])
+        raise argparse.ArgumentTypeError(f"{text}: is none of {known}, or lacks its number")
+    return DETECTORS[name](int(number)) if equals else DETECTORS[name]
 
 
 def _estimator() -> dict[str, Any]:

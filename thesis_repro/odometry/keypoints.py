@@ -1,7 +1,6 @@
 """Detectors beside the thesis's, for settings: OdometrySettings(detector=spread(200)).
 
-A new one is a function or class here and its name in DETECTORS. It uses no other name of this
-module: it stands for itself in records of runs (`running.code_used`).
+A new one is a function or, with a number, a class here, and its name in DETECTORS.
 
 A detector is a function of a frame (height, width), settings and a mask, (height, width) or None,
 which allows keypoints where it is not 0. It returns (N, 2) float32 pixels, strongest first. Those
@@ -128,8 +127,8 @@ def filtered(
     return points[mask[rows, columns] > 0]
 
 
-# {name: detector}. Each is thesis_repro.NAME and, unless it needs a number, --detector NAME, which
-# the first line of its docstring explains.
+# {name: detector}. Each is thesis_repro.NAME and --detector NAME, or NAME=N if it needs a number.
+# The first line of its docstring explains it.
 DETECTORS: dict[str, Callable] = {
     detector.__name__: detector for detector in (orb, filtered, spread, filled)
 }
