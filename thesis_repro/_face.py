@@ -24,13 +24,18 @@ from thesis_repro.odometry.estimators import refined
 from thesis_repro.odometry.keypoints import DETECTORS
 
 
-def build_unet(*arguments: Any, **options: Any) -> Any:
+def build_unet(
+    input_shape: tuple[int | None, int | None, int],
+    n_classes: int,
+    base_filters: int = 64,
+    corrected_blocks: bool = False,
+) -> Any:
     """Build the U-Net of appendix A.4; (320, 320, 1), 35 are those of the thesis.
 
-    The arguments are those of thesis_repro.segmentation.unet.build_unet, which needs TensorFlow.
+    The arguments are explained in thesis_repro.segmentation.unet, which needs TensorFlow.
     """
     try:
         from thesis_repro.segmentation import unet
     except ImportError as error:
         raise missing_package(error) or error from None
-    return unet.build_unet(*arguments, **options)
+    return unet.build_unet(input_shape, n_classes, base_filters, corrected_blocks)

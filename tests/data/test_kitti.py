@@ -28,8 +28,12 @@ def test_reads_a_sequence(tiny_kitti):
     short = sequence.subset(2)
     assert len(short) == len(short.poses) == len(short.times) == 2
     assert len(sequence.subset(99)) == len(sequence.subset(None)) == 4
+    assert repr(short).startswith("Sequence 00: 2 frames with true poses")
     with pytest.raises(InputError, match="subset"):
         sequence[:2]
+    for count in (0, -1):
+        with pytest.raises(InputError, match="subset"):
+            sequence.subset(count)
 
 
 def test_colour_jpeg_frames_are_read_as_gray_with_the_colour_camera(tiny_kitti):

@@ -31,6 +31,16 @@ def test_arrays_give_the_bits_of_a_sequence(street):
     assert [frame.sum() for frame in whole] == [image.sum() for image in street.images]
 
 
+def test_what_it_is_is_shown(street):
+    assert repr(drive(street)) == "Sequence frames in memory: 6 frames without true poses"
+    named = drive(street, poses=POSES, name="walk")
+    assert repr(named) == "Sequence walk: 6 frames with true poses"
+    odometry = tr.Odometry(street.intrinsics)
+    for _ in range(2):
+        odometry.step(street.frame(0), 1.0)
+    assert "2 frames" in repr(odometry) and "(0.00, 0.00, 0.00)" in repr(odometry)
+
+
 @pytest.mark.parametrize(
     "lengths, expected",
     [

@@ -152,6 +152,7 @@ def test_label_masks_and_written_masks_equal_the_filter(labelled, tmp_path):
         expected = masks.keypoint_mask(bands("road", "sky"), (48, 64), 4, settings)
         folders.write_masks(made, tmp_path / "masks")
         assert len(made) == 4 and np.array_equal(made[3], expected)
+        assert "4 masks of 64x48 pixels, dilation width 4" in repr(made)
         assert np.array_equal(folders.MaskFolder(tmp_path / "masks", sequence)[1], expected)
 
 

@@ -1,7 +1,10 @@
+from inspect import signature
+
 import pytest
 
 from thesis.diagrams import summary_rows
 from thesis.reported import REPORTED
+from thesis_repro import build_unet as public
 from thesis_repro.errors import InputError
 from thesis_repro.segmentation.unet import build_unet
 
@@ -35,6 +38,14 @@ def test_corrected_blocks_and_base_filters():
         ("conv2d_18", "output_shape", "(None, 64, 64, 5)"),
     ):
         assert rows[layer][column] == text
+
+
+def test_the_public_name_has_the_same_arguments():
+    ours, shown = (signature(each).parameters for each in (build_unet, public))
+    assert [str(each) for each in shown.values()] == [str(each) for each in ours.values()]
+    assert public((32, 32, 1), 3, 2, True).count_params() == (
+        build_unet((32, 32, 1), 3, 2, True).count_params()
+    )
 
 
 def test_a_size_that_cannot_be_halved_four_times():

@@ -107,6 +107,10 @@ class ArraySequence:
         """Size (height, width) of the first frame."""
         return self.frame(0).shape
 
+    def __repr__(self) -> str:
+        truth = "with" if self.has_truth else "without"
+        return f"Sequence {self.name}: {len(self)} frames {truth} true poses"
+
     def __len__(self) -> int:
         return len(self._frames)
 

@@ -203,6 +203,10 @@ class Sequence:
         """File names of label maps and masks: the names of the frames, with the ending .png."""
         return [f"{path.stem}.png" for path in self.frame_paths]
 
+    def __repr__(self) -> str:
+        truth = "with" if self.has_truth else "without"
+        return f"Sequence {self.name}: {len(self)} frames {truth} true poses, {self.folder}"
+
     def __len__(self) -> int:
         return len(self.frame_paths)
 
@@ -266,7 +270,9 @@ class Sequence:
         return pixels.ndim == 3 and pixels.shape[2] == 4
 
     def subset(self, count: int | None) -> "Sequence":
-        """Copy of the sequence with its first `count` frames; None for all frames."""
+        """Copy of the sequence with its first `count` frames, 1 or more; None for all frames."""
+        if count is not None and count < 1:
+            raise InputError(f"sequence {self.name}: subset({count}); must be 1 frame or more")
         short = copy(self)
         short.frame_paths, short.times = self.frame_paths[:count], self.times[:count]
         if self.has_truth:

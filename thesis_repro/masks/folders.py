@@ -63,6 +63,13 @@ class LabelMasks:
     def __len__(self) -> int:
         return len(self.paths)
 
+    def __repr__(self) -> str:
+        height, width = self.size
+        return (
+            f"LabelMasks: {len(self)} masks of {width}x{height} pixels, dilation width "
+            f"{self.dilation_width}, {self.paths[0].parent}"
+        )
+
     def label_map(self, index: int) -> np.ndarray:
         """Label map of frame `index`, in label ids."""
         path = self.paths[index]

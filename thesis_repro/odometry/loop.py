@@ -161,6 +161,13 @@ class Odometry:
         self.points = NO_POINTS  # in it
         self.metres = 0.0  # moved since then
 
+    def __repr__(self) -> str:
+        x, y, z = self.pose[:3, 3]
+        return (
+            f"Odometry: {self.count} frames so far, position ({x:.2f}, {y:.2f}, {z:.2f}) m, "
+            f"{len(self.points)} points to track"
+        )
+
     def step(self, frame: Any, scale: Any = None, mask: Any = None) -> Step:
         """Take the next frame. Returns a Step.
 
