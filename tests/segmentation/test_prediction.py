@@ -1,8 +1,6 @@
 """Predicted label maps, model files, and the quality of label maps."""
 
 import json
-import zipfile
-from pathlib import Path
 
 import cv2
 import h5py
@@ -173,119 +171,29 @@ def test_model_files_that_cannot_be_used_are_named(suffix, model, tmp_path):
             training.load_model(path)
 
 
-def test_a_network_of_keras_2_gives_what_it_gave_there():
-    """`keras_2.h5` is a file of tf_keras 2.21, and these are its probabilities and classes there.
-
-    It has DepthwiseConv2D, SeparableConv2D, SpatialDropout2D, RandomFlip and Conv2DTranspose, a
-    Sequential that is called twice, and a network of two outputs within the network.
-    """
-    network = training.load_model(Path(__file__).parent / "keras_2.h5")
-    images = np.random.default_rng(0).integers(0, 256, (1, 16, 32, 3), np.uint8)
-    probabilities = np.asarray(network(images.astype(np.float32), training=False))
-    expected = [0.249994, 0.000351, 0.724935, 0.0014, 0.020734, 0.002587]
-    assert probabilities[0, 3, 5] == pytest.approx(expected, abs=1e-5)
-    counts = np.bincount(prediction.predict(network, images).ravel(), minlength=6)
-    assert counts == pytest.approx([113, 1, 236, 9, 33, 120], abs=2)
-
-
-def as_keras_2(layer):
-    """A layer's description in the words of Keras 2."""
-    for key in ("module", "registered_name", "build_config"):
-        layer.pop(key, None)
-    config = layer["config"]
-    config.pop("quantization_config", None)
-    for key, value in config.items():
-        if isinstance(value, dict) and "module" in value:
-            config[key] = {name: value[name] for name in ("class_name", "config")}
-    if isinstance(config["dtype"], dict):
-        config["dtype"] = "float32"
-    if "batch_shape" in config:
-        config["batch_input_shape"] = config.pop("batch_shape")
-
-
-@pytest.fixture
-def of_keras_2(tmp_path):
-    """A function that writes a Sequential as Keras 2 did, after a change of its description."""
-
-    def write(*layers, change=lambda description: None):
-        convolution = keras.layers.Conv2D(3, 1, activation="softmax")
-        network = keras.Sequential([keras.Input((8, 16, 1)), *layers, convolution])
-        path = tmp_path / "model.h5"
-        network.save(path)
-        with h5py.File(path, "r+") as file:
-            description = json.loads(file.attrs["model_config"])
-            description["config"] = {
-                "name": "sequential",
-                "layers": description["config"]["layers"],
-            }
-            for layer in description["config"]["layers"]:
-                as_keras_2(layer)
-            change(description)
-            file.attrs["model_config"] = json.dumps(description)
-        return path, network
-
-    return write
-
-
-def without_input(description):  # before Keras 2.3, the first layer stated the size
-    first = description["config"]["layers"].pop(0)
-    shape = first["config"]["batch_input_shape"]
-    description["config"]["layers"][0]["config"]["batch_input_shape"] = shape
-
-
-def plain_list(description):  # before Keras 2.2.3
-    without_input(description)
-    description["config"] = description["config"]["layers"]
-
-
-def mixed(description):
-    policy = {"class_name": "Policy", "config": {"name": "float32"}}
-    description["config"]["layers"][1]["config"]["dtype"] = policy
-
-
-@pytest.mark.parametrize("change", [without_input, plain_list, mixed])
-def test_older_descriptions_load(change, of_keras_2):
-    path, network = of_keras_2(keras.layers.Conv2D(4, 3, padding="same"), change=change)
-    images = np.random.default_rng(0).integers(0, 256, (1, 8, 16, 1), np.uint8)
-    assert np.array_equal(training.load_model(path)(images), network(images))
-    as_keras = path.rename(path.with_suffix(".keras"))  # Keras 2 wrote HDF5 under this name, too
-    assert np.array_equal(training.load_model(as_keras)(images), network(images))
-
-
-def another_class(name, **config):
-    def change(description):
-        layer = description["config"]["layers"][1]
-        layer["class_name"] = name
-        layer["config"] |= config
-
-    return change
-
-
-@pytest.mark.parametrize(
-    "change, named",
-    [
-        (another_class("TFOpLambda", function="image.resize"), r"TFOpLambda \(image.resize\)"),
-        (another_class("Lambda"), "holds code"),
-        (another_class("Activation", activation="hard_sigmoid"), "hard_sigmoid"),
-        (another_class("LayerNormalization", axis=[1, 2, 3]), "LayerNormalization over several"),
-        (another_class("Activation", nonsense=1), "Activation.*nonsense"),
-    ],
-)
-def test_what_keras_3_lacks_or_computes_otherwise_is_named(change, named, of_keras_2):
-    path, _ = of_keras_2(keras.layers.Activation("relu"), change=change)
-    with pytest.raises(InputError, match=f"model.h5: .*{named}") as error:
-        training.load_model(path)
-    assert "truncated" not in str(error.value)
-
-
-def test_files_of_keras_2_without_a_network_or_in_its_own_form_are_named(tmp_path):
-    with zipfile.ZipFile(tmp_path / "model.keras", "w") as file:
-        file.writestr("metadata.json", '{"keras_version": "2.15.0"}')
-    with h5py.File(tmp_path / "weights.h5", "w") as file:
-        file.create_group("model_weights")
-    for name, said in (("model.keras", "Keras 2.15.0.*HDF5"), ("weights.h5", "weights alone")):
-        with pytest.raises(InputError, match=f"{name}: .*{said}"):
-            training.load_model(tmp_path / name)
+def test_a_file_of_keras_2_is_refused_and_its_weights_load(tmp_path):
+    """A file as Keras 2 wrote it: one setting more, which Keras 3 lacks."""
+    old, new = tmp_path / "old.hdf5", tmp_path / "new.keras"
+    written = untrained(4)
+    written.save(old)
+    with h5py.File(old, "r+") as file:
+        description = json.loads(file.attrs["model_config"])
+        for layer in description["config"]["layers"]:
+            if layer["class_name"] == "Conv2DTranspose":
+                layer["config"]["groups"] = 1
+        file.attrs["model_config"] = json.dumps(description)
+    way_out = r"load_weights\('old.hdf5'\), save\('new.keras'\)"
+    with pytest.raises(InputError, match=f"layer Conv2DTranspose.*build_unet.*{way_out}"):
+        training.load_model(old)
+    network = untrained(5)
+    network.load_weights(old)
+    network.save(new)
+    loaded = training.load_model(new)
+    assert np.array_equal(prediction.predict(loaded, IMAGES), prediction.predict(written, IMAGES))
+    with h5py.File(old, "r+") as file:
+        del file.attrs["model_config"]
+    with pytest.raises(InputError, match=f"old.hdf5: .*weights alone.*{way_out}"):
+        training.load_model(old)
 
 
 def test_a_saved_model_folder_and_code_in_a_file_are_named(tmp_path):
@@ -294,9 +202,10 @@ def test_a_saved_model_folder_and_code_in_a_file_are_named(tmp_path):
         training.load_model(tmp_path / "saved_model")
     inputs = keras.Input((SIZE, SIZE, 1))
     code = keras.layers.Lambda(lambda x: x + 1)(inputs)
-    keras.Model(inputs, code).save(tmp_path / "code.keras")
-    with pytest.raises(InputError, match="holds code"):
-        training.load_model(tmp_path / "code.keras")
+    for name in ("code.keras", "code.h5"):
+        keras.Model(inputs, code).save(tmp_path / name)
+        with pytest.raises(InputError, match="holds code"):
+            training.load_model(tmp_path / name)
 
 
 def test_confusion_matrix_and_cityscapes_scores():

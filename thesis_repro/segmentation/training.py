@@ -21,11 +21,15 @@ from thesis_repro import segmentation
 from thesis_repro.data.cityscapes import CLASS_WEIGHTS, N_CLASSES
 from thesis_repro.errors import InputError
 from thesis_repro.running import files, program, provenance
-from thesis_repro.segmentation import augmentation, keras_2
+from thesis_repro.segmentation import augmentation
 from thesis_repro.segmentation.exact import same_bits
 
 # files of a training: the network with the lowest validation loss, and what a training resumes from
 MODEL, HISTORY, STATE = "model.keras", "history.csv", "state.npz"
+# the way out for a file that Keras 3 does not read
+REBUILD = (
+    "build the network (the thesis's: tr.build_unet), load_weights('old.hdf5'), save('new.keras')"
+)
 
 
 def total_loss() -> Any:
@@ -291,7 +295,7 @@ class ResumableTraining(keras.callbacks.Callback):
 
 
 def load_model(path: str | Path) -> Any:
-    """Load a model saved by Keras 2 or 3, `.keras` or HDF5, without loss and metrics.
+    """Load a model saved by Keras, `.keras` or HDF5, without loss and metrics.
 
     Code in the file is never executed: Keras' safe mode refuses it, and all layers that are not
     Keras' own. The classes may be any up to 256; those of the thesis's network are Cityscapes' ids.
@@ -306,10 +310,7 @@ def load_model(path: str | Path) -> Any:
     if not Path(path).is_file():
         raise InputError(f"{path}: no such model; train one or name another file")
     try:
-        with keras_2.readable(path) as as_today:
-            model = keras.models.load_model(as_today, compile=False, safe_mode=True)
-    except InputError:
-        raise
+        model = keras.models.load_model(path, compile=False, safe_mode=True)
     except Exception as error:  # Keras, h5py and zipfile raise many kinds
         raise InputError(f"{path}: {_refusal(error)}") from None
     shapes: Any = [getattr(model, name, ()) for name in ("input_shape", "output_shape")]
@@ -334,8 +335,8 @@ def _refusal(error: Exception) -> str:
     cause = next((line for line in lines if line.startswith("Exception encountered: ")), lines[0])
     cause = cause.removeprefix("Exception encountered: ")[:200]
     if layer := re.match(r"Error when deserializing class '(\w+)'", lines[0]):
-        return f"Keras 3 does not read its layer {layer[1]} ({cause}); {keras_2.REBUILD}"
+        return f"Keras 3 does not read its layer {layer[1]} ({cause}); {REBUILD}"
     return (
-        f"not a Keras model, truncated, or holds code ({cause}); build it from Keras' own layers, or "
-        "copy it again"
+        f"not a Keras model, truncated, or holds code ({cause}); copy it again, or build it from Keras' own "
+        f"layers; of Keras 2, or weights alone: {REBUILD}"
     )
