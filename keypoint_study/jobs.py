@@ -8,7 +8,6 @@ the number of keypoints that masks leave, so they are made once the masked runs 
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from functools import cache
 from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -106,38 +105,43 @@ def runs_of(
     sources: of the jobs. settings: changes of all runs; masked_settings: of those with masks. Masks
     with equal records are one object, by which `odometry.run_many` recognises that runs share work.
     """
-    sources_by_name = {source.name: source for source in sources}
-    default = next(iter(sources_by_name.values()))
+    by_name = {source.name: source for source in sources}
+    default = next(iter(by_name.values()))
     opened = {sequence.name: sequence for sequence in sequences}
-
+    chosen: dict[Job, Run | str] = {}  # what jobs share that differ in estimator and shuffle alone
     known: dict[Any, Any] = {}  # masks
-
-    @cache
-    def choice(
-        method: str, sequence: str, source: str, width: int | None, number: int | None
-    ) -> Run | str:
-        given, frames = sources_by_name.get(source, default), opened[sequence]
-        if method == "keypoints":
-            return Run(frames, THESIS, brought=given)
-        asked = Asked(frames, given, CONTROL_WIDTH if width is None else width, number or 0)
-        try:
-            own, masks = METHODS[method].choose(asked)
-        except InputError as error:
-            return str(error)
-        if masks is not None:
-            key = sequence, str(recorded(masks)), tuple(getattr(masks, "paths", ()))
-            masks = known.setdefault(key, masks)
-        return Run(frames, own, masks)
-
     runs: dict[Job, Run | str] = {}
     for job in jobs:
-        run = choice(job.method, job.sequence, job.source, job.dilation_width, job.max_keypoints)
+        alike = replace(job, estimator="thesis", repetition=0)
+        if alike not in chosen:
+            source = by_name.get(job.source, default)
+            chosen[alike] = _choose(job, opened[job.sequence], source, known)
+        run = chosen[alike]
         if not isinstance(run, str):
             of_masks = masked_settings if run.masks is not None else {}
             changes = {**settings, **job.changes(), **of_masks}
             run = run._replace(settings=changed(run.settings, changes))
         runs[job] = run
     return runs
+
+
+def _choose(job: Job, sequence: Sequence, source: Source, known: dict[Any, Any]) -> Run | str:
+    """Return the run of a job with its method's settings, or the reason why it cannot run.
+
+    known: masks, by what they are made from.
+    """
+    if job.method == "keypoints":
+        return Run(sequence, THESIS, brought=source)
+    width = CONTROL_WIDTH if job.dilation_width is None else job.dilation_width
+    asked = Asked(sequence, source, width, job.max_keypoints or 0)
+    try:
+        settings, masks = METHODS[job.method].choose(asked)
+    except InputError as error:
+        return str(error)
+    if masks is not None:
+        key = sequence.name, str(recorded(masks)), tuple(getattr(masks, "paths", ()))
+        masks = known.setdefault(key, masks)
+    return Run(sequence, settings, masks)
 
 
 def first_jobs(

@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass, replace
 from functools import cache
 from itertools import chain
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
@@ -24,18 +24,27 @@ from keypoint_study.methods import CONTROL, METHODS, of_group
 from keypoint_study.path_errors import path_errors
 from keypoint_study.sources import Source
 from thesis_repro import odometry
-from thesis_repro.data.layout import layout_of
 from thesis_repro.data.sequence import Sequence
 from thesis_repro.errors import InputError, cause
 from thesis_repro.odometry.estimators import COMPARED
 from thesis_repro.odometry.runs import is_flagged, poses_of
 from thesis_repro.running import program, provenance
-from thesis_repro.running.code_used import digest_of_code
 from thesis_repro.running.files import progress, write_text
 from thesis_repro.running.workers import open_pool
 
 NEARLY = 1.1  # controls keep as many keypoints if the ratio is within 1 / NEARLY to this
 SETTINGS = "settings.json"  # of the runs in a folder
+# The code that makes runs. What a method chooses stands in the record of each run, so a new entry
+# in METHODS repeats nothing.
+CODE = (
+    "thesis_repro/odometry",
+    "thesis_repro/masks",
+    "thesis_repro/data",
+    "opencv_exact",
+    "keypoint_study/ablations.py",
+    "keypoint_study/controls.py",
+    "keypoint_study/sources.py",
+)
 # Passes for each of several workers. Every pass decodes and tracks anew: a sequence on two workers
 # takes 13 % more CPU time than in one pass, and with 4 pieces 35 %.
 PIECES = 2
@@ -69,37 +78,18 @@ class Outcome:
         )
 
 
-class Measure(NamedTuple):
-    """What is measured of runs.
-
-    name: of the progress bar. code: the function whose module measures, for records. make: from
-    {job: run}, runs over one sequence, to {job: table of its file, or the reason why it has none}.
-    rows: from a job's file, when that was changed (ns), and the sequence to its rows of the table.
-    needs_truth: whether it needs true poses. divided: whether several workers may share a sequence;
-    not if its runs are compared with something that all of them share.
-    """
-
-    name: str
-    code: Callable
-    make: Callable[[Mapping[Job, Run]], dict[Job, pd.DataFrame | str]]
-    rows: Callable[[Job, Path, int, Sequence], list[dict[str, Any]]]
-    needs_truth: bool = True
-    divided: bool = True
-
-
 def run_all(
     runs: Mapping[Job, Run | str],
     folder: Path,
-    measure: Measure | None = None,
     *,
     processes: int = 1,
     scheduler: str | None = None,
 ) -> Outcome:
     """Run what has no result yet; returns the table of all runs and how many ran.
 
-    runs: of `jobs.runs_of`; a text is the reason why a job cannot run. measure: PATH if not given.
-    folder: for the results, one file a run. Results of another sequence, measure or odometry in it
-    are moved aside; runs with other settings, masks or code of these are made again.
+    runs: of `jobs.runs_of`; a text is the reason why a job cannot run. folder: for the results, one
+    file a run. Results of another sequence or odometry in it are moved aside; runs with other
+    settings or masks are made again.
     processes, scheduler: see `workers.open_pool`; the results do not depend on them. The workers of
     a scheduler need this package, and all folders under the same paths. One thread a worker is
     best.
@@ -110,44 +100,19 @@ def run_all(
     Raises InputError if another process is using the folder, if all runs fail, or if a worker is
     lost.
     """
-    measure = measure or PATH
     reasons = {job: run for job, run in runs.items() if isinstance(run, str)}
     possible = {job: run for job, run in runs.items() if not isinstance(run, str)}
-    sequences = {run.sequence.name: run.sequence for run in possible.values()}
     with provenance.claimed(folder):
-        for name, sequence in sequences.items():
-            if measure.needs_truth and not sequence.has_truth:
-                raise InputError(
-                    f"{sequence.poses_path}: no such file; without ground truth, sequence {name} has no "
-                    "errors to compare; leave it out (the odometry command runs it)"
-                )
-            versions = _versions(measure, sequence)
-            provenance.stage(folder / name, **versions, sequence=sequence.digest())
-        _drop_changed(possible, folder)
+        _prepare(possible, folder)
         waiting = {job: run for job, run in possible.items() if not _file(folder, job).is_file()}
-        with open_pool(processes, scheduler) as pool:
-            calls = [
-                (measure, of_pass, folder, _seen(measure, of_pass, folder))
-                for of_pass in _in_passes(waiting, pool.size if measure.divided else 0)
-            ]
-            frames = [
-                sum(len(run.sequence) for run in of_pass.values()) for _, of_pass, *_ in calls
-            ]
-            with progress(None, measure.name, total=sum(frames), unit="frame") as bar:
-                for count, failed in zip(frames, pool.run(_run_pass, calls), strict=True):
-                    reasons |= failed
-                    bar.update(count)
+        reasons |= _run(waiting, folder, processes, scheduler)
     warnings = _report(reasons)
-    rows = []
-    for job, run in possible.items():
-        path = _file(folder, job)
-        if path.is_file():
-            rows += measure.rows(job, path, path.stat().st_mtime_ns, run.sequence)
-    if not rows:
+    table = _read(possible, folder)
+    if table.empty:
         first = next(iter(reasons.values()))
         raise InputError(f"all {len(runs)} runs failed; the first: {first}")
     made = sum(_file(folder, job).is_file() for job in waiting)
-    return Outcome(pd.DataFrame(rows), made, reasons, warnings)
+    return Outcome(table, made, reasons, warnings)
 
 
 def _file(folder: Path, job: Job) -> Path:
@@ -155,55 +120,72 @@ def _file(folder: Path, job: Job) -> Path:
     return folder / job.sequence / f"{job.name}.csv"
 
 
-def _versions(measure: Measure, sequence: Sequence, *used: Any) -> dict[str, Any]:
-    """Return what the runs over a sequence depend on beside data: code, and other packages."""
-    return {
-        "code": digest_of_code(measure.code, *reader_of(sequence), *used),
-        **provenance.versions("opencv", "numpy", "numba"),
-    }
+# Prepare: results of other inputs go
 
 
-def reader_of(sequence: Any) -> list[Any]:
-    """Return what reads a sequence: its class and, if it is in a folder, the layout of this."""
-    folder = getattr(sequence, "folder", None)
-    return [type(sequence), *([layout_of(folder)] if folder else [])]
+def _prepare(runs: Mapping[Job, Run], folder: Path) -> None:
+    """Move aside, or delete, what was made from other inputs than runs have now."""
+    sequences = {job.sequence: run.sequence for job, run in runs.items()}
+    digest = cache(provenance.digest_of_files)
+    for name, sequence in sequences.items():
+        if not sequence.has_truth:
+            raise InputError(
+                f"{sequence.poses_path}: no such file; without ground truth, sequence {name} has no "
+                "errors to compare; leave it out (the odometry command runs it)"
+            )
+        provenance.stage(folder / name, **_versions(), sequence=sequence.digest())
+        records = {
+            job.name: _record(run, digest) for job, run in runs.items() if job.sequence == name
+        }
+        _drop_changed(records, folder / name)
 
 
-def record_of(run: Run, digest: Callable = provenance.digest_of_files) -> dict[str, Any]:
+def _versions() -> dict[str, Any]:
+    """Return what all runs depend on beside data: code, and other packages."""
+    code = provenance.digest_of_code(*CODE)
+    return {"code": code, **provenance.versions("opencv", "numpy", "numba")}
+
+
+def _record(run: Run, digest: Callable) -> dict[str, Any]:
     """Return what a run depends on beside its sequence. digest: of files, which may remember."""
-    _, settings, masks, brought = run
-    parts = [part for part in (masks, brought) if part is not None]
+    parts = [part for part in (run.masks, run.brought) if part is not None]
     paths = chain(*(getattr(part, "paths", ()) for part in parts))
-    return {
-        **settings.record(),
+    record = {
+        **run.settings.record(),
         "masks": [recorded(part) for part in parts],
         "files": digest(tuple(dict.fromkeys(paths))),
-        "code": digest_of_code(settings.detector, settings.estimator, *parts),
     }
+    return dict(json.loads(json.dumps(record, default=float)))  # numbers of NumPy, tuples
 
 
-def _drop_changed(runs: Mapping[Job, Run], folder: Path) -> None:
-    """Delete the results of runs that were made with other settings, masks or code of these."""
-    digest = cache(provenance.digest_of_files)
-    known: dict[Any, Any] = {}  # of runs that differ in numbers alone
-    now: dict[str, dict[str, Any]] = {}
-    for job, run in runs.items():
-        sequence, settings, *rest = run
-        key = id(settings.detector), id(settings.estimator), *map(id, rest)
-        if key not in known:
-            known[key] = record_of(run, digest)
-        record = {**known[key], **settings.record()}
-        now.setdefault(sequence.name, {})[job.name] = json.loads(
-            json.dumps(record, default=float)
-        )  # of numpy
-    for name, records in now.items():
-        path = folder / name / SETTINGS
-        before = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
-        for of_run, record in records.items():
-            if before.get(of_run, record) != record:
-                (folder / name / f"{of_run}.csv").unlink(missing_ok=True)
-        if before | records != before:
-            write_text(path, json.dumps(before | records, indent=1))
+def _drop_changed(records: dict[str, dict[str, Any]], folder: Path) -> None:
+    """Delete the results of runs over one sequence whose records differ from those before."""
+    path = folder / SETTINGS
+    before = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    for name, record in records.items():
+        if before.get(name, record) != record:
+            (folder / f"{name}.csv").unlink(missing_ok=True)
+    if before | records != before:
+        write_text(path, json.dumps(before | records, indent=1))
+
+
+# Run: what has no result
+
+
+def _run(
+    runs: Mapping[Job, Run], folder: Path, processes: int, scheduler: str | None
+) -> dict[Job, str]:
+    """Make runs, here or on workers. Returns the reasons of the jobs that failed."""
+    reasons: dict[Job, str] = {}
+    with open_pool(processes, scheduler) as pool:
+        passes = _in_passes(runs, pool.size)
+        calls = [(of_pass, folder, _seen(of_pass, folder)) for of_pass in passes]
+        frames = [sum(len(run.sequence) for run in of_pass.values()) for of_pass in passes]
+        with progress(None, "odometry", total=sum(frames), unit="frame") as bar:
+            for count, failed in zip(frames, pool.run(_run_pass, calls), strict=True):
+                reasons |= failed
+                bar.update(count)
+    return reasons
 
 
 def _in_passes(runs: Mapping[Job, Run], workers: int) -> list[dict[Job, Run]]:
@@ -211,46 +193,34 @@ def _in_passes(runs: Mapping[Job, Run], workers: int) -> list[dict[Job, Run]]:
 
     Each of several workers gets about PIECES passes, so that all end at about the same time. Runs
     with the same keypoints stay in one pass, where they share most of their work. A single worker
-    gets one pass a sequence. What runs in place of the odometry shares nothing. workers: 0 if all
-    runs of a sequence must be in one pass; the longest sequence is then the first.
+    gets one pass a sequence. Own keypoints share nothing.
     """
-    passes: list[dict[Job, Run]] = []
-    groups: dict[str, dict[Any, dict[Job, Run]]] = {}  # of the same keypoints, by sequence
+    passes = [{job: run} for job, run in runs.items() if run.brought]
+    sharing: dict[tuple, dict[Job, Run]] = {}  # by sequence and keypoints
     for job, run in runs.items():
-        if run.brought and workers:
-            passes.append({job: run})
-            continue
-        keypoints = id(run.masks), *run.settings.detection_values()
-        groups.setdefault(job.sequence, {}).setdefault(keypoints, {})[job] = run
+        if not run.brought:
+            keypoints = job.sequence, run.masks, run.settings.detection_values()
+            sharing.setdefault(keypoints, {})[job] = run
     lengths = {job.sequence: len(run.sequence) for job, run in runs.items()}
-    if not workers:
-        groups = dict(sorted(groups.items(), key=lambda each: -lengths[each[0]]))
     # work is measured in frames, of which a group of runs reads each once
-    work = sum(lengths[name] * len(of_sequence) for name, of_sequence in groups.items())
-    for name, by_keypoints in groups.items():
-        of_sequence = list(by_keypoints.values())
-        size = len(of_sequence)
-        if workers > 1:
-            size = max(1, round(work / (PIECES * workers) / lengths[name]))
-        for start in range(0, len(of_sequence), size):
-            parts = (group.items() for group in of_sequence[start : start + size])
+    work = sum(lengths[sequence] for sequence, *_ in sharing)
+    for name, length in lengths.items():
+        groups = [group for (sequence, *_), group in sharing.items() if sequence == name]
+        size = len(groups) if workers == 1 else round(work / (PIECES * workers) / length)
+        size = max(1, size)  # groups of a pass
+        for start in range(0, len(groups), size):
+            parts = (group.items() for group in groups[start : start + size])
             passes.append(dict(chain(*parts)))
     return passes
 
 
-def _seen(measure: Measure, runs: Mapping[Job, Run], folder: Path) -> dict[str, Any]:
-    """Return what a worker must see as the main process does: records, code and packages."""
-    ((sequence, *_), *_) = runs.values()
-    used = chain(
-        *((run.settings.detector, run.settings.estimator, *run[2:]) for run in runs.values())
-    )
-    record = provenance.record(folder / sequence.name)
-    return {"record": record, **_versions(measure, sequence, *used)}
+def _seen(runs: Mapping[Job, Run], folder: Path) -> dict[str, Any]:
+    """Return what a worker must see as the main process does: the record, code and packages."""
+    sequence = next(iter(runs)).sequence
+    return {"record": provenance.record(folder / sequence), **_versions()}
 
 
-def _run_pass(
-    measure: Measure, runs: dict[Job, Run], folder: Path, seen: dict[str, Any]
-) -> dict[Job, str]:
+def _run_pass(runs: dict[Job, Run], folder: Path, seen: dict[str, Any]) -> dict[Job, str]:
     """Make runs over one sequence in one pass, here or on another machine.
 
     seen: see `_seen`. Returns the reasons of the jobs that failed.
@@ -259,12 +229,12 @@ def _run_pass(
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)  # the processes already use every core
     try:
-        if _seen(measure, runs, folder) != seen:
+        if _seen(runs, folder) != seen:
             raise InputError(
                 f"{folder}: this worker sees other files there, or has other code or versions of packages; "
                 "give all workers the same folders under the same paths and the same packages"
             )
-        for job, result in measure.make(runs).items():
+        for job, result in _frames_of(runs).items():
             if isinstance(result, str):
                 reasons[job] = result
             else:
@@ -277,7 +247,7 @@ def _run_pass(
     return reasons
 
 
-def _paths(runs: Mapping[Job, Run]) -> dict[Job, pd.DataFrame | str]:
+def _frames_of(runs: Mapping[Job, Run]) -> dict[Job, pd.DataFrame | str]:
     """Return the frames of runs over one sequence, or the reasons why they failed."""
     failed: dict[Job, str] = {}
     together = {job: run for job, run in runs.items() if run.brought is None}
@@ -296,9 +266,31 @@ def _paths(runs: Mapping[Job, Run]) -> dict[Job, pd.DataFrame | str]:
     return {job: failed.get(job) or made[job].frames for job in runs}
 
 
-def _rows_of_path(job: Job, path: Path, changed: int, sequence: Sequence) -> list[dict[str, Any]]:
-    measured = _measured(path, changed, sequence)
-    return [{"sequence": job.sequence, "run": job.name, **asdict(job), **measured}]
+def _report(reasons: Mapping[Job, str]) -> list[str]:
+    """Print and return one line for the failed runs of a sequence that have the same reason."""
+    by_reason: dict[tuple[str, str], list[str]] = {}
+    for job, reason in reasons.items():
+        by_reason.setdefault((job.sequence, reason), []).append(job.name)
+    lines = []
+    for (name, reason), runs in by_reason.items():
+        shown = textwrap.shorten(", ".join(runs), 80, placeholder=" ...")
+        lines.append(f"sequence {name}, {shown}: failed: {reason}")
+        program.log.warning(lines[-1])
+    return lines
+
+
+# Read: the table of all runs
+
+
+def _read(runs: Mapping[Job, Run], folder: Path) -> pd.DataFrame:
+    """Return the table of the runs that have a result, one row a job."""
+    rows = []
+    for job, run in runs.items():
+        path = _file(folder, job)
+        if path.is_file():
+            measured = _measured(path, path.stat().st_mtime_ns, run.sequence)
+            rows.append({"sequence": job.sequence, "run": job.name, **asdict(job), **measured})
+    return pd.DataFrame(rows)
 
 
 @cache  # a study calls `run_all` again, with more jobs
@@ -318,20 +310,15 @@ def _measured(path: Path, changed: int, sequence: Sequence) -> dict[str, Any]:
     }
 
 
-PATH = Measure("odometry", odometry.run_many, _paths, _rows_of_path)
+def run_poses(runs: pd.DataFrame, folder: Path) -> dict[tuple[str, str], np.ndarray]:
+    """Return {(sequence, run): estimated poses (n, 4, 4)} for each row of a table of runs."""
+    return {
+        (name, run): poses_of(pd.read_csv(folder / name / f"{run}.csv"))
+        for name, run in zip(runs["sequence"], runs["run"], strict=True)
+    }
 
 
-def _report(reasons: Mapping[Job, str]) -> list[str]:
-    """Print and return one line for the failed runs of a sequence that have the same reason."""
-    by_reason: dict[tuple[str, str], list[str]] = {}
-    for job, reason in reasons.items():
-        by_reason.setdefault((job.sequence, reason), []).append(job.name)
-    lines = []
-    for (name, reason), runs in by_reason.items():
-        shown = textwrap.shorten(", ".join(runs), 80, placeholder=" ...")
-        lines.append(f"sequence {name}, {shown}: failed: {reason}")
-        program.log.warning(lines[-1])
-    return lines
+# Controls without a mask
 
 
 def number_warnings(runs: pd.DataFrame, sources: Iterable[Source]) -> list[str]:
@@ -379,17 +366,8 @@ def keypoint_controls(
                 continue
             number = keypoints[sequence.name]
             job = Job(sequence.name, "fewer", width_of_source, source=source.name)
-            fewer = replace(
-                job, max_keypoints=max(1, round(number))
-            )  # OpenCV takes 0 as "no limit"
+            limit = max(1, round(number))  # OpenCV takes 0 as "no limit"
+            fewer = replace(job, max_keypoints=limit)
             spread = replace(job, method="spread", min_distance=min_distance(sequence, number))
             jobs += repeated([fewer, spread], estimators, repetitions)
     return jobs
-
-
-def run_poses(runs: pd.DataFrame, folder: Path) -> dict[tuple[str, str], np.ndarray]:
-    """Return {(sequence, run): estimated poses (n, 4, 4)} for each row of a table of runs."""
-    return {
-        (name, run): poses_of(pd.read_csv(folder / name / f"{run}.csv"))
-        for name, run in zip(runs["sequence"], runs["run"], strict=True)
-    }
