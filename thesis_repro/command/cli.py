@@ -100,12 +100,10 @@ def odometry(options: Any) -> None:
     with redirect_stdout(sys.stderr):  # evo prints a line when it first writes its own settings
         import evo.main_ape  # noqa: F401
     from thesis_repro import checks, odometry
-    from thesis_repro.odometry import metrics
     from thesis_repro.odometry.estimators import ESTIMATORS
 
     if options.plot:
-        from keypoint_study.report import paths, style
-
+        import keypoint_study.report.paths  # noqa: F401  a missing package is told before the run
     settings = replace(
         odometry.THESIS,
         detector=_detector(options),
@@ -122,19 +120,10 @@ def odometry(options: Any) -> None:
         result.write_kitti(options.output)
     if options.tum:
         result.write_tum(options.tum)
-    steps = len(sequence), result.failed_steps, result.dropped_steps
-    program.warn(checks.run_warnings(sequence.name, *steps, settings.scale_gate))
-    if sequence.has_truth:
-        program.warn(checks.inverted_truth(sequence, result.poses))
+    _warn_of_run(result, sequence, settings.scale_gate)
     record = _record(result, sequence)
     if options.plot:
-        truth, poses = None, result.poses
-        if sequence.has_truth:
-            truth = sequence.poses
-            poses = metrics.shifted(poses, truth)
-        with style.applied():
-            drawing = paths.figure_of_paths({"estimate": poses}, truth, f"sequence {sequence.name}")
-            style.write_figure(drawing, options.plot)
+        _draw_path(result, sequence, options.plot)
     print(json.dumps(record) if options.json else _text(record, sequence, options.speed))
     for name, path in _output_files(options).items():
         program.log.info(f"{path}: {OUTPUT_FILES[name][0]}")
@@ -192,6 +181,30 @@ COMMANDS = {
 
 
 # Helpers of several commands
+
+
+def _warn_of_run(result: Any, sequence: Any, scale_gate: float) -> None:
+    """Warn of what a run and its true poses look like if the input was not what it seemed."""
+    from thesis_repro import checks
+
+    steps = len(sequence), result.failed_steps, result.dropped_steps
+    program.warn(checks.run_warnings(sequence.name, *steps, scale_gate))
+    if sequence.has_truth:
+        program.warn(checks.inverted_truth(sequence, result.poses))
+
+
+def _draw_path(result: Any, sequence: Any, file: Path) -> None:
+    """Draw the path of a run, beside the true one if there is one."""
+    from keypoint_study.report import paths, style
+    from thesis_repro.odometry import metrics
+
+    truth, poses = None, result.poses
+    if sequence.has_truth:
+        truth = sequence.poses
+        poses = metrics.shifted(poses, truth)
+    with style.applied():
+        drawing = paths.figure_of_paths({"estimate": poses}, truth, f"sequence {sequence.name}")
+        style.write_figure(drawing, file)
 
 
 # {error of `metrics.errors`: its name in a record}

@@ -57,8 +57,6 @@ def explain(error: BaseException) -> str | None:
     """
     if isinstance(error, (ImportError, AttributeError)):
         error = missing_package(error) or error
-    if type(error).__name__ == "TerminatedWorkerError":  # of joblib, which has a page of text
-        return "a process was killed, most likely because memory ran out; use fewer (--jobs, JOBS)"
     if isinstance(error, (InputError, OSError, MemoryError)):
         return one_line(error) or "memory ran out"
     return None
