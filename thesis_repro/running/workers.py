@@ -7,7 +7,7 @@ whose workers died.)
 import logging
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, wait
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from threading import RLock
 from typing import Any, NamedTuple
 
@@ -58,14 +58,27 @@ def _begin() -> None:
     tqdm.set_lock(RLock())  # its own is a semaphore of the system, which an ended worker leaves
 
 
+def open_pool(processes: int, scheduler: str | None = None) -> AbstractContextManager[Pool]:
+    """Open a pool on a Dask scheduler or, without one, on processes of this machine.
+
+    processes: their number; one is this process. scheduler: its address, "tcp://host:8786".
+    Raises InputError if the scheduler does not answer or has no workers, or if a worker is lost.
+    """
+    return _here(processes) if scheduler is None else _on_cluster(scheduler)
+
+
 @contextmanager
-def _closed(client: Any) -> Iterator[None]:
-    """Close a client of Dask at the end; this fails now and then if its scheduler has ended."""
+def _here(processes: int) -> Iterator[Pool]:
+    executor = _processes(processes) if processes > 1 else None
+    if executor is None:
+        yield Pool(1)
+        return
     try:
-        yield
+        yield Pool(processes, executor)
+    except BrokenExecutor:
+        raise InputError(LOST) from None
     finally:
-        with suppress(RuntimeError, OSError, TimeoutError):
-            client.close()
+        executor.shutdown(kill_workers=True)
 
 
 def _processes(number: int) -> ProcessPoolExecutor | None:
@@ -81,24 +94,7 @@ def _processes(number: int) -> ProcessPoolExecutor | None:
 
 
 @contextmanager
-def open_pool(processes: int, scheduler: str | None = None) -> Iterator[Pool]:
-    """Open a pool on a Dask scheduler or, without one, on processes of this machine.
-
-    processes: their number; one is this process. scheduler: its address, "tcp://host:8786".
-    Raises InputError if the scheduler does not answer or has no workers, or if a worker is lost.
-    """
-    executor = _processes(processes) if scheduler is None and processes > 1 else None
-    if scheduler is None:
-        if executor is None:
-            yield Pool(1)
-            return
-        try:
-            yield Pool(processes, executor)
-        except BrokenExecutor:
-            raise InputError(LOST) from None
-        finally:
-            executor.shutdown(kill_workers=True)
-        return
+def _on_cluster(scheduler: str) -> Iterator[Pool]:
     from dask.distributed import Client, KilledWorker  # imported here because it takes a second
 
     for name in ("distributed", "distributed.client"):  # workers and the scheduler may come and go
@@ -110,25 +106,27 @@ def open_pool(processes: int, scheduler: str | None = None) -> Iterator[Pool]:
             f"Dask scheduler {scheduler}: does not answer ({type(error).__name__}); start one with "
             "'dask scheduler' and give the address that it prints, tcp://host:port"
         ) from None
-    with _closed(client):
+
+    def check() -> None:
+        try:
+            client.sync(client.scheduler.identity, callback_timeout=TIMEOUT)
+        except (OSError, TimeoutError):
+            raise InputError(
+                f"Dask scheduler {scheduler}: no longer answers; finished results are kept; start it "
+                "again, with workers, and repeat the command"
+            ) from None
+
+    try:
         size = sum(client.nthreads().values())
         if not size:
             raise InputError(
                 f"Dask scheduler {scheduler}: has no workers; start some with "
                 f"'dask worker {scheduler} --nthreads 1'"
             )
-
-        def check() -> None:
-            try:
-                client.sync(client.scheduler.identity, callback_timeout=TIMEOUT)
-            except (OSError, TimeoutError):
-                raise InputError(
-                    f"Dask scheduler {scheduler}: no longer answers; finished results are kept; start it "
-                    "again, with workers, and repeat the command"
-                ) from None
-
-        try:
-            yield Pool(size, client.get_executor(pure=False), check)
-        except (KilledWorker, CancelledError):
-            check()
-            raise InputError(LOST) from None
+        yield Pool(size, client.get_executor(pure=False), check)
+    except (KilledWorker, CancelledError):
+        check()
+        raise InputError(LOST) from None
+    finally:
+        with suppress(RuntimeError, OSError, TimeoutError):  # now and then, if its scheduler ended
+            client.close()
