@@ -21,7 +21,7 @@ from keypoint_study.jobs import CONTROL_WIDTH
 from keypoint_study.plan import Study
 from keypoint_study.report import comparison, style
 from keypoint_study.sources import Source
-from thesis import domain_gap
+from thesis import map_quality
 from thesis.reported import REPORTED
 from thesis.settings import PROFILES, ROOT
 from thesis_repro.data import cityscapes, kitti
@@ -262,8 +262,8 @@ def write(options, folders, held_out):
     if options.kitti_semantic:
         domains["KITTI's street scenes"] = cityscapes.pairs(options.kitti_semantic, "train")
     by_seed = {f"seed {seed}": network for seed, network in networks.items()}
-    scores = domain_gap.scores_of_models(by_seed, domains)
-    style.save_table(domain_gap.table_of_scores(scores), out, "scores", note)
+    scores = map_quality.scores_of_models(by_seed, domains)
+    style.save_table(map_quality.table_of_scores(scores), out, "scores", note)
     if options.kitti:  # label maps take minutes, so only the first network makes them
         table = table_of_streets(networks[first], options.kitti, folders[first])
         style.save_table(table, out, "streets", note)

@@ -1,9 +1,9 @@
 """The audit: where the thesis contradicts itself, its code or its libraries, and what that does.
 
-audit.json holds the rows. A measurement is one line of a row's numbers: notebook 09,
-`audit_of_tables` and `audit_of_data` make them, and `audit_table` joins them to the rows. Ratios
-come from `keypoint_study.ratios`. Intervals of other means are those of Student's t over `n`
-values: sequences unless said otherwise.
+audit.json holds the rows, and for each number of a row a key and what is measured. `measurement`
+makes a number from a row, a key and values; notebook 09 and `audit_numbers` call it. `audit_table`
+joins them to the rows. The page in git has the words of each row once, and the numbers of two runs
+beside them.
 """
 
 import json
@@ -13,52 +13,54 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from keypoint_study import comparisons, ratios
+from keypoint_study import ratios
+from keypoint_study.report import style
+from thesis.reported import REPORTED
 
 ROWS = json.loads((Path(__file__).parent / "audit.json").read_text(encoding="utf-8"))["rows"]
-CALLED = {  # column of a table: its name in the audit
-    "rmse": "RMSE",
-    "mae": "MAE",
-    "mean_keypoints": "keypoints",
-    "rotation": comparisons.METRIC_TITLES["rotation"],
-    "in_turns": "rotation error in turns",
-    "on_straights": "rotation error on straights",
-    "se3": "aligned ATE",
-    "translation_percent": "translation error over 20 m",
-    "rotation_deg_per_100m": "rotation error over 20 m",
-}
+MEASURED = {row["row"]: row.pop("measured", {}) for row in ROWS}  # {row: {key: what is measured}}
 TEXTS = ["quantity", "metric", "estimator", "unit", "data"]
 VALUES = ["quantity", "metric", "estimator", "value", "unit", "low", "high", "n", "frames", "data"]
+# the thesis's changes in percent, one row a sequence
+CHANGES = pd.DataFrame(
+    {
+        "RMSE": REPORTED["table_4_2_rmse_percent_change"],
+        "MAE": REPORTED["table_4_3_mae_percent_change"],
+    }
+)
+WIDTHS = range(9, 12)  # the dilation widths that the thesis calls best
+WORDS = ["where", "the thesis or its code", "what would be right", "switch"]
+NAMED = ["row", "quantity", "metric", "estimator", "unit"]  # what a number is
+ARITHMETIC = "the thesis's numbers"  # in the column data: needs no run
 
 
-def measurement(
-    row: str, quantity: str, values: Any, unit: str = "", **more: Any
-) -> dict[str, Any]:
+def measurement(row: str, key: str, values: Any, unit: str = "", **more: Any) -> dict[str, Any]:
     """Return one measurement for a row of the audit: a mean, its interval and number of values.
 
-    more: further columns (metric, estimator, frames, data).
+    key: of what is measured, in audit.json. more: further columns (metric, estimator, frames,
+    data). Raises KeyError for an unknown row or key.
     """
     numbers = np.asarray(values, float).ravel()
     numbers = numbers[~np.isnan(numbers)]
     mean = numbers.mean() if len(numbers) else np.nan
     low, high = ratios.mean_interval(numbers)
-    texts = {"row": row, "quantity": quantity, "unit": unit}
+    texts = {"row": row, "quantity": MEASURED[row][key], "unit": unit}
     return {**texts, "value": mean, "low": low, "high": high, "n": len(numbers), **more}
 
 
-def share(row: str, quantity: str, percentages: Any, **more: Any) -> dict[str, Any]:
+def share(row: str, key: str, percentages: Any, **more: Any) -> dict[str, Any]:
     """Return one measurement for a row of the audit: the mean of shares in percent.
 
     The interval is cut at 0 and 100, which no share exceeds. A transform that needs no cut (the
     logit) is not defined for shares of exactly 0 or 100, which occur.
     """
-    mean = measurement(row, quantity, percentages, "%", **more)
+    mean = measurement(row, key, percentages, "%", **more)
     low, high = np.clip([mean["low"], mean["high"]], 0, 100).tolist()
     return {**mean, "low": low, "high": high}
 
 
 def ratio(
-    row: str, quantity: str, of_streets: Any, geometric_mean: bool = False, **more: Any
+    row: str, key: str, of_streets: Any, geometric_mean: bool = False, **more: Any
 ) -> dict[str, Any]:
     """Return one measurement for a row of the audit: the ratio over one ratio a sequence.
 
@@ -68,21 +70,24 @@ def ratio(
     typical = ratios.typical_ratio(of_streets)
     value, low, high = (typical[name] for name in names)
     return measurement(
-        row, quantity, [], "ratio", value=value, low=low, high=high, n=typical["n"], **more
+        row, key, [], "ratio", value=value, low=low, high=high, n=typical["n"], **more
     )
+
+
+def on(quantity: str, threads: int) -> str:
+    """Return the words for a time on so many threads. If they say nothing, it is one."""
+    return quantity if threads == 1 else f"{quantity}, {threads} threads"
 
 
 def audit_table(measurements: list[dict[str, Any]], data: str = "this run") -> pd.DataFrame:
     """Return the audit as a table with one line a measurement.
 
     The first line of each row has the row's texts. data: the origin of measurements that name none.
-    Numbers are rounded (see `rounded`). Raises KeyError for a measurement of an unknown row.
+    Numbers are rounded (see `rounded`).
     """
     headings = {"does": "the thesis or its code", "right": "what would be right"}
     words = pd.DataFrame(ROWS).rename(columns=headings)
     numbers = pd.DataFrame(measurements).reindex(columns=["row", *VALUES])
-    if unknown := set(numbers["row"]) - set(words["row"]):
-        raise KeyError(*unknown)
     numbers = numbers.astype(dict.fromkeys(TEXTS, object)).fillna({"data": data})
     lines = words.merge(numbers, on="row", how="left").fillna(dict.fromkeys(TEXTS, ""))
     repeated = lines["row"].duplicated()
@@ -106,6 +111,62 @@ def clear_effects(table: pd.DataFrame) -> pd.DataFrame:
 
     Row 14, a largest over a smallest error, cannot be below 1 and is left out.
     """
-    no_errors = ["", CALLED["mean_keypoints"]]
-    lines = table[(table["unit"] == "ratio") & ~table["metric"].isin(no_errors)]
+    lines = table[(table["unit"] == "ratio") & ~table["metric"].isin(["", "keypoints"])]
     return lines[((lines["low"] > 1) | (lines["high"] < 1)) & (lines["row"] != "14")]
+
+
+# The page
+
+
+def page(folder: Path, real: Path, note: str) -> str:
+    """Return the page, made from audit.csv of the run in git and of the one on real frames.
+
+    folder: of the page and of the run in git. real: in it. note: names the data of the run in git.
+    """
+    at = real.name
+    data = {"embedded world": note, "real frames": f"[{at}]({at}/README.md)"}
+    tables = dict(zip(data, map(_read, (folder, real))))
+    notes = []
+    for name, table in tables.items():
+        times = [each for each in table["data"].unique() if each.startswith("timed on")]
+        notes.append(f"Column {name}: {'; '.join([data[name], *times])}.")
+    notes.append("In parentheses: 95 % intervals. Numbers of sequences and frames:")
+    notes.append(f"[audit.csv](audit.csv), [{at}/audit.csv]({at}/audit.csv).")
+    return f"{style.markdown(side_by_side(tables))}\n{' '.join(notes)}\n"
+
+
+def side_by_side(tables: dict[str, pd.DataFrame]) -> pd.DataFrame:
+    """Return audits as one table: a column of values, with their 95 % intervals, for each of them.
+
+    Another column has what is arithmetic with the thesis's numbers, the same in all. The first line
+    of a row has the row's words, those of the first audit. tables: {name: its audit.csv, as texts}.
+    """
+    lines = pd.concat([table.assign(column=name) for name, table in tables.items()])
+    lines["column"] = lines["column"].mask(lines["data"] == ARITHMETIC, ARITHMETIC)
+    lines["number"] = [*map(_number, lines["value"], lines["low"], lines["high"])]
+    numbers = {
+        tuple(line[:-1]): line[-1] for line in lines[[*NAMED, "column", "number"]].to_numpy()
+    }
+    shown = lines[NAMED].drop_duplicates()
+    has_numbers = set(shown.loc[shown["quantity"] != "", "row"])
+    shown = shown[(shown["quantity"] != "") | ~shown["row"].isin(has_numbers)]
+    shown = shown.sort_values("row", key=lambda row: row.astype(int), kind="stable")
+    for column in (ARITHMETIC, *tables):
+        shown[column] = [numbers.get((*line, column), "") for line in shown[NAMED].to_numpy()]
+    words = lines.drop_duplicates("row").set_index("row")[WORDS].loc[shown["row"]]
+    words[shown["row"].duplicated().to_numpy()] = ""
+    return pd.concat(
+        [words.reset_index(), shown.drop(columns="row").reset_index(drop=True)], axis=1
+    )
+
+
+def _read(folder: Path) -> pd.DataFrame:
+    return pd.read_csv(folder / "audit.csv", dtype=str, keep_default_na=False)
+
+
+def _number(value: str, low: str, high: str) -> str:
+    """Return a value and its interval, if it has one: "0.766 (0.43 to 5.9)"."""
+    if not value:
+        return ""
+    ends = f" ({float(low):g} to {float(high):g})" if low and high else ""
+    return f"{float(value):g}{ends}"

@@ -30,7 +30,7 @@ from keypoint_study import comparisons, ratios, verdicts
 from keypoint_study.jobs import CONTROL_WIDTH
 from keypoint_study.path_errors import ERRORS
 from keypoint_study.report import style, texts
-from thesis import audit_of_tables, equal_number, section_4_2
+from thesis import audit, equal_number, section_4_2
 from thesis.reported import REPORTED
 from thesis_repro.odometry import THESIS
 
@@ -51,7 +51,7 @@ LIMIT = THESIS.max_keypoints
 REDUCTION = REPORTED["headline_claims"]["keypoint_reduction_factor"]
 SAVED = REPORTED["headline_claims"]["time_savings_percent"]
 NAMED = ("00", "01", "02", "06", "08", "10")  # on which masks are said to do well
-RMSE_OF_THESIS = {"metric": "RMSE", "estimator": "thesis"}
+RMSE_OF_THESIS: dict[str, Any] = {"metric": "RMSE", "estimator": "thesis"}
 
 
 def is_on_side(of_streets: pd.Series, side: int) -> str:
@@ -169,31 +169,34 @@ class Tables:
     """The tables in git that the claims are tested on. read: of one of them, by its name."""
 
     def __init__(self, read: Callable[[str], pd.DataFrame]) -> None:
-        self.runs, self.shuffled, self.few = (
-            read(f"{REAL}{name}") for name in ("runs", "shuffled_runs", "few_keypoints_runs")
-        )
-        self.ablations = read(f"{REAL}ablations")
+        self.runs, self.shuffled = read(f"{REAL}runs"), read(f"{REAL}shuffled_runs")
+        self.few, self.ablations = read(f"{REAL}few_keypoints_runs"), read(f"{REAL}ablations")
         self.audits = {"real": read(f"{REAL}audit"), "embedded": read("audit")}
+        self.threads = read(f"{REAL}timings/seconds")["threads"].max()  # of all cores
         self.width = comparisons.tested_width(self.runs) or CONTROL_WIDTH
 
-    def of(
-        self, method: str, estimator: str = "thesis", widths: Sequence[int] = ()
-    ) -> pd.DataFrame:
-        """Return the runs of a method; of masks, by default those of the tested width."""
+    def every_width(self) -> pd.DataFrame:
+        """Return the runs with masks of every width and the thesis's estimator."""
+        return comparisons.of_method(self.runs, "masked", "thesis")
+
+    def runs_of(self, method: str, estimator: str = "thesis") -> pd.DataFrame:
+        """Return the runs of a method; of masks, those of the tested width."""
         rows = comparisons.of_method(self.runs, method, estimator)
-        if method == "masked":
-            rows = rows[rows["dilation_width"].isin(widths or [self.width])]
-        return rows
+        return rows[rows["dilation_width"] == self.width] if method == "masked" else rows
 
     def over(
         self, method: str, metric: str, estimator: str = "thesis", other: str = "baseline"
     ) -> pd.Series:
         """Return the ratios of an error to that of another method, by street."""
-        return ratios.ratios_of(self.of(method, estimator), self.of(other, estimator), metric)
+        chosen, reference = self.runs_of(method, estimator), self.runs_of(other, estimator)
+        return ratios.ratios_of(chosen, reference, metric)
 
-    def audit(self, row: str, quantity: str, where: str = "real", **more: str) -> dict[str, Any]:
-        """Return value, low, high and n of a measurement of the audit."""
-        rows, named = self.audits[where], {"row": row, "quantity": quantity} | more
+    def measured(
+        self, row: str, key: str, where: str = "real", threads: int = 1, **more: str
+    ) -> dict[str, Any]:
+        """Return value, low, high and n of a measurement of the audit, by its key in audit.json."""
+        named = {"row": row, "quantity": audit.on(audit.MEASURED[row][key], threads)} | more
+        rows = self.audits[where]
         (found,) = rows[(rows[list(named)] == pd.Series(named)).all(axis=1)].to_dict("records")
         return found
 
@@ -232,92 +235,125 @@ def text_of_claims(claims: list[Claim], note: str) -> str:
 
 def _of_errors(tables: Tables) -> list[Claim]:
     """Return the claims about errors with masks, in the order of Section 4.2."""
-    masked = comparisons.of_method(tables.runs, "masked", "thesis")
-    every, widths = tables.of("baseline"), masked["dilation_width"].nunique()
-    claims = []
-    for metric, printed in (("rmse", "13.2"), ("mae", "25.65")):
+    rmse, mae = (Procedure.on(tables, metric) for metric in ("rmse", "mae"))
+    return [
+        _aggregate(tables, rmse, "13.2"),
+        _aggregate(tables, mae, "25.65"),
+        _most_sequences(tables, rmse),
+        _as_well(tables),
+        _named_sequences(tables, rmse),
+    ]
+
+
+class Procedure(NamedTuple):
+    """What the thesis's literal procedure gives here.
+
+    changes: (%) of a metric, by sequence. studies: the same in simulated studies in which masks do
+    nothing, one row a study.
+    """
+
+    metric: str
+    changes: pd.Series
+    studies: pd.DataFrame
+
+    @classmethod
+    def on(cls, tables: Tables, metric: str) -> "Procedure":
+        """Apply the procedure to the runs at hand."""
+        masked, every = tables.every_width(), tables.runs_of("baseline")
+        widths = masked["dilation_width"].nunique()
         changes = section_4_2.changes_of_repetition(masked, every, metric)
-        studies = section_4_2.null_distribution(tables.shuffled, widths, metric)
-        by_chance = studies.mean(axis=1)
-        low, high = section_4_2.middle(by_chance)
-        mean = audit_of_tables.CHANGES[metric.upper()].mean()
-        claims.append(
-            Claim(
-                f"aggregate {metric}",
-                "4.2, 5.1",
-                f"Masks lower the {metric.upper()} by {printed} %, a sum of eleven percentages. (Their "
-                f"mean: {mean:.2f} %.)",
-                f"Mean {changes.mean():.2f} %; if masks did nothing, {by_chance.mean():.2f} % "
-                f"({low:.2f} to {high:.2f}).",
-                against_chance(changes.mean(), by_chance),
-                f"Sum here: {changes.sum():.0f} %. Width {tables.width}, fixed before: "
-                f"{_ratio(tables.over('masked', metric))} times the error of all keypoints.",
-            )
-        )
-        if metric == "rmse":
-            improved, by_luck = (changes < 0).sum(), (studies < 0).sum(axis=1)
-    in_tables = (audit_of_tables.CHANGES < 0).sum()
+        return cls(metric, changes, section_4_2.null_distribution(tables.shuffled, widths, metric))
+
+
+def _aggregate(tables: Tables, found: Procedure, printed: str) -> Claim:
+    """Return the claim on a sum of percentages. printed: in the thesis."""
+    name, changes, by_chance = found.metric.upper(), found.changes, found.studies.mean(axis=1)
+    low, high = section_4_2.middle(by_chance)
+    return Claim(
+        f"aggregate {found.metric}",
+        "4.2, 5.1",
+        f"Masks lower the {name} by {printed} %, a sum of eleven percentages. (Their mean: "
+        f"{audit.CHANGES[name].mean():.2f} %.)",
+        f"Mean {changes.mean():.2f} %; if masks did nothing, {by_chance.mean():.2f} % "
+        f"({low:.2f} to {high:.2f}).",
+        against_chance(changes.mean(), by_chance),
+        f"Sum here: {changes.sum():.0f} %. Width {tables.width}, fixed before: "
+        f"{_ratio(tables.over('masked', found.metric))} times the error of all keypoints.",
+    )
+
+
+def _most_sequences(tables: Tables, found: Procedure) -> Claim:
+    """Return the claim that errors fall on most sequences."""
+    improved, by_luck = (found.changes < 0).sum(), (found.studies < 0).sum(axis=1)
+    in_tables = (audit.CHANGES < 0).sum()
     fixed = tables.over("masked", "rmse")
-    claims.append(
-        Claim(
-            "most sequences",
-            "4.2, 5.1",
-            f"Errors fall on all sequences but three. (In its tables: RMSE on {in_tables['RMSE']}, MAE "
-            f"on {in_tables['MAE']} of 11.)",
-            f"RMSE lower on {improved} of {len(changes)}; on {by_luck.mean():.2f} if masks did nothing.",
-            against_chance(-improved, -by_luck.to_numpy()),
-            f"Width {tables.width}: lower on {(fixed < 1).sum()} of {len(fixed)}.",
-        )
+    return Claim(
+        "most sequences",
+        "4.2, 5.1",
+        f"Errors fall on all sequences but three. (In its tables: RMSE on {in_tables['RMSE']}, MAE "
+        f"on {in_tables['MAE']} of 11.)",
+        f"RMSE lower on {improved} of {len(found.changes)}; on {by_luck.mean():.2f} if masks did "
+        "nothing.",
+        against_chance(-improved, -by_luck.to_numpy()),
+        f"Width {tables.width}: lower on {(fixed < 1).sum()} of {len(fixed)}.",
+    )
+
+
+def _as_well(tables: Tables) -> Claim:
+    """Return the claim that masks do as well as all keypoints."""
+    fixed = tables.over("masked", "rmse")
+    shuffles = ratios.range_of_shuffles(tables.runs).query("estimator == 'thesis'")["factor"]
+    refined = pd.DataFrame(
+        {error: tables.over("masked", error, "refined") for error in comparisons.JUDGING_METRICS}
     )
     equal, places = (
         equal_number.over(*_few(tables.few, (choice, 200), ("random", 200)))
         for choice in ("mask", "random-on")
     )
-    shuffles = ratios.range_of_shuffles(tables.runs).query("estimator == 'thesis'")["factor"]
-    refined = {
-        error: tables.over("masked", error, "refined") for error in comparisons.JUDGING_METRICS
-    }
-    claims.append(
-        Claim(
-            "as well",
-            "4, 4.2, 5.1",
-            "Masks do as well as all keypoints, or slightly better.",
-            f"Width {tables.width}: RMSE {_ratio(fixed)} times that of all, higher on "
-            f"{(fixed > 1).sum()} of {len(fixed)}.",
-            is_as_good(fixed),
-            "Within the numerical accuracy, says the thesis: shuffling the points alone changes the RMSE "
-            f"by a factor of {shuffles.median():.2f}, at most {shuffles.max():.2f}. Refined estimator: "
-            f"aligned ATE {_ratio(refined['se3'])}, rotation "
-            f"{_ratio(refined['rotation'])}: {equal_number.word(pd.DataFrame(refined))}. At an equal "
-            f"number, 200 over 200 random ones, thesis's estimator: {_ratio(equal['se3'])}, "
-            f"{_ratio(equal['rotation'])}: {equal_number.word(equal)}; random ones on the mask: "
-            f"{_ratio(places['se3'])}, {_ratio(places['rotation'])}: {equal_number.word(places)}.",
-        )
+    return Claim(
+        "as well",
+        "4, 4.2, 5.1",
+        "Masks do as well as all keypoints, or slightly better.",
+        f"Width {tables.width}: RMSE {_ratio(fixed)} times that of all, higher on "
+        f"{(fixed > 1).sum()} of {len(fixed)}.",
+        is_as_good(fixed),
+        "Within the numerical accuracy, says the thesis: shuffling the points alone changes the RMSE "
+        f"by a factor of {shuffles.median():.2f}, at most {shuffles.max():.2f}. Refined estimator: "
+        f"aligned ATE {_ratio(refined['se3'])}, rotation {_ratio(refined['rotation'])}: "
+        f"{equal_number.word(refined)}. At an equal number, 200 over 200 random ones, thesis's "
+        f"estimator: {_judged(equal)}; random ones on the mask: {_judged(places)}.",
     )
-    changes = section_4_2.changes_of_repetition(masked, every, "rmse")
+
+
+def _judged(of_streets: pd.DataFrame) -> str:
+    """Return the typical ratios of both deciding errors, and their word."""
+    errors = ", ".join(_ratio(of_streets[error]) for error in comparisons.JUDGING_METRICS)
+    return f"{errors}: {equal_number.word(of_streets)}"
+
+
+def _named_sequences(tables: Tables, found: Procedure) -> Claim:
+    """Return the claim on sequences on which masks do well."""
+    changes = found.changes
     shown = ", ".join(f"{name} {changes[name]:+.0f} %" for name in NAMED if name in changes)
-    claims.append(
-        Claim(
-            "named sequences",
-            "4.2",
-            "Masks do extremely well on 00, 01, 02, 08 and 10, and by the look of the paths on 06.",
-            f"RMSE of the best width: {shown}. The others are not at hand.",
-            CANNOT_TELL,
-            f"On 01, runs fail, with masks ({_failed(tables.of('masked'), '01')}) and with all "
-            f"keypoints ({_failed(every, '01')}).",
-        )
+    failed = [_failed(tables.runs_of(method), "01") for method in ("masked", "baseline")]
+    return Claim(
+        "named sequences",
+        "4.2",
+        "Masks do extremely well on 00, 01, 02, 08 and 10, and by the look of the paths on 06.",
+        f"RMSE of the best width: {shown}. The others are not at hand.",
+        CANNOT_TELL,
+        f"On 01, runs fail, with masks ({failed[0]}) and with all keypoints ({failed[1]}).",
     )
-    return claims
 
 
 def _of_widths(tables: Tables) -> list[Claim]:
     """Return the claims about the dilation width."""
-    masked = comparisons.of_method(tables.runs, "masked", "thesis")
-    best = section_4_2.best_widths(masked)["dilation_width"].isin(audit_of_tables.WIDTHS)
+    masked = tables.every_width()
+    best = section_4_2.best_widths(masked)["dilation_width"].isin(audit.WIDTHS)
     kept = masked.groupby(["sequence", "dilation_width"])["mean_keypoints"].mean().unstack()
     rising = kept.diff(axis=1).iloc[:, 1:].gt(0).all(axis=1)
-    same = tables.audit("2", "pairs of repetitions with the same best width")
-    others = tables.audit("35", "widths 9 to 11 over the other widths", estimator="thesis")
+    same = tables.measured("2", "same best")
+    others = tables.measured("35", "9 to 11", estimator="thesis")
     return [
         Claim(
             "widths",
@@ -340,25 +376,18 @@ def _of_widths(tables: Tables) -> list[Claim]:
 
 def _of_keypoints(tables: Tables) -> list[Claim]:
     """Return the claims about the number of keypoints."""
-    masked = comparisons.of_method(tables.runs, "masked", "thesis")
+    masked = tables.every_width()
     best = section_4_2.best_widths(masked)["mean_keypoints"]
     factor = ratios.typical_ratio(LIMIT / best)
     reported = pd.DataFrame(REPORTED["table_4_1"])["mean_keypoints"]
-    fixed = tables.of("masked").groupby("sequence")["mean_keypoints"].mean()
-    every = tables.of("baseline").groupby("sequence")["mean_keypoints"].mean()
+    fixed = tables.runs_of("masked").groupby("sequence")["mean_keypoints"].mean()
+    every = tables.runs_of("baseline").groupby("sequence")["mean_keypoints"].mean()
     low, high = ratios.mean_interval(best)
     reduced, few = tables.over("reduced", "rmse"), tables.over("fewer", "se3")
-    of_masks = tables.audit(
-        "33", "plainly reduced over masks of the best width", estimator="thesis"
-    )
+    of_masks = tables.measured("33", "over best", estimator="thesis")
     fewer = tables.over("fewer", "rmse")
-    tenth = tables.audit("59", "nine tenths of the keypoints over all", **RMSE_OF_THESIS)
-    names = ("dropout", "baseline")
-    of_names = [comparisons.of_method(tables.ablations, name, "thesis") for name in names]
-    failing, failing_of_all = (
-        ratios.failing_sequences(ratios.has_failed(runs).set_axis(runs["sequence"]))
-        for runs in of_names
-    )
+    tenth = tables.measured("59", "dropout", **RMSE_OF_THESIS)
+    failing, failing_of_all = _failing(tables, "dropout"), _failing(tables, "baseline")
     spread = equal_number.over(*_few(tables.few, ("spread", 200), ("all", 0)))
     return [
         Claim(
@@ -411,20 +440,17 @@ def _of_keypoints(tables: Tables) -> list[Claim]:
 
 def _of_time(tables: Tables) -> list[Claim]:
     """Return the claims about time. Times are those of the machine that made the evidence."""
-    total = tables.audit("47", audit_of_tables.TIME_TOGETHER)
-    typical = tables.audit("47", audit_of_tables.TIME_TYPICAL)
-    narrow = tables.audit("47", audit_of_tables.TIME_OF_NARROW)
-    times = tables.audits["real"]["quantity"]
-    of_all_cores = times[times.str.startswith(audit_of_tables.TIME_TYPICAL)].iloc[-1]
-    both = tables.audit("47", of_all_cores)
-    whole = tables.audit("16", "whole frame with masks and network over all keypoints")
+    total, typical = tables.measured("47", "together"), tables.measured("47", "typical")
+    of_all_cores = tables.measured("47", "typical", threads=tables.threads)
+    narrow = tables.measured("47", "narrow")
+    whole = tables.measured("16", "network")
     return [
         Claim(
             "time",
             "4.2, 5.1",
             "Widths of 9 to 11 save 5 to 10 % of the time.",
-            f"One machine{of_all_cores.removeprefix(audit_of_tables.TIME_TYPICAL)}: {_saved(both)}.",
-            is_within(_saved_ends(both), SAVED[0], SAVED[1], both["n"]),
+            f"{audit.on('One machine', tables.threads)}: {_saved(of_all_cores)}.",
+            is_within(_saved_ends(of_all_cores), SAVED[0], SAVED[1], of_all_cores["n"]),
             f"On one thread: {_saved(typical)}; all streets together (Equation 4.2): "
             f"{-total['value']:.0f} %. "
             "With the package's network, which is smaller than the thesis's, a frame takes about "
@@ -443,24 +469,12 @@ def _of_time(tables: Tables) -> list[Claim]:
 def _of_causes(tables: Tables) -> list[Claim]:
     """Return the claims about what causes errors."""
     turns = tables.over("masked", "in_turns")
-    steady = tables.audit(
-        "38",
-        "label maps that do not fluctuate over predicted ones",
-        "embedded",
-        estimator="refined",
-    )
-    on_01 = ratios.has_failed(tables.of("baseline").query("sequence == '01'"))
-    refined_on_01 = _failed(tables.of("baseline", "refined"), "01")
-    thin = [
-        tables.audit("87", f"boundary pixels of poles and signs with an edge, thresholds {pair}")
-        for pair in ("5 and 15", "20 and 60")
-    ]
-    lost = {
-        kind: tables.audit("73", "keypoints not found again in the next frame", metric=kind)[
-            "value"
-        ]
-        for kind in ("all", "on predicted boundaries")
-    }
+    steady = tables.measured("38", "steady", "embedded", estimator="refined")
+    on_01 = ratios.has_failed(tables.runs_of("baseline").query("sequence == '01'"))
+    refined_on_01 = _failed(tables.runs_of("baseline", "refined"), "01")
+    thin, thin_high = tables.measured("87", "thin 5/15"), tables.measured("87", "thin 20/60")
+    lost = tables.measured("73", "lost", metric="all")
+    lost_on_masks = tables.measured("73", "lost", metric="on predicted boundaries")
     return [
         Claim(
             "sequence 01",
@@ -491,16 +505,16 @@ def _of_causes(tables: Tables) -> list[Claim]:
             "thin things",
             "4.2",
             "Thresholds as low as 5 and 15 are needed to find poles and signs.",
-            f"{thin[0]['value']:.0f} % of their boundary pixels have an edge; with 20 and 60, "
-            f"{thin[1]['value']:.0f} %.",
-            are_apart(_ends(thin[0]), _ends(thin[1])),
+            f"{thin['value']:.0f} % of their boundary pixels have an edge; with 20 and 60, "
+            f"{thin_high['value']:.0f} %.",
+            are_apart(_ends(thin), _ends(thin_high)),
         ),
         Claim(
             "found again",
             "2.2.3, 3.6, 5.1",
             "Keypoints on boundaries are found again in the next frames.",
-            f"Not found again: {lost['on predicted boundaries']:.0f} % on boundaries, "
-            f"{lost['all']:.0f} % of all, in a few pairs of frames.",
+            f"Not found again: {lost_on_masks['value']:.0f} % on boundaries, "
+            f"{lost['value']:.0f} % of all, in a few pairs of frames.",
             CANNOT_TELL,
         ),
         Claim(
@@ -522,18 +536,11 @@ def _of_causes(tables: Tables) -> list[Claim]:
 
 def _of_the_network(tables: Tables) -> list[Claim]:
     """Return the claims about the network. Cityscapes is not at hand."""
-    small, large = (
-        tables.audit("86", quantity, "embedded")
-        for quantity in (
-            "accuracy on poles, lights, signs and people",
-            "accuracy on all other classes",
-        )
-    )
-    library, whole = (
-        tables.audit("20", quantity, "embedded")["value"]
-        for quantity in ("library's IoU score", "mean IoU of one confusion matrix")
-    )
-    sky = tables.audit("46", "recall of the sky", "embedded")["value"]
+    small = tables.measured("86", "small", "embedded")["value"]
+    large = tables.measured("86", "large", "embedded")["value"]
+    library = tables.measured("20", "library", "embedded")["value"]
+    whole = tables.measured("20", "whole", "embedded")["value"]
+    sky = tables.measured("46", "sky", "embedded")["value"]
     return [
         Claim(
             "scores",
@@ -550,8 +557,7 @@ def _of_the_network(tables: Tables) -> list[Claim]:
             "The network does well on large objects and struggles with small ones.",
             "Cityscapes is not at hand.",
             CANNOT_TELL,
-            f"Embedded world: {large['value']:.0f} % and {small['value']:.0f} % of their pixels are "
-            "right.",
+            f"Embedded world: {large:.0f} % and {small:.0f} % of their pixels are right.",
         ),
         Claim(
             "sky",
@@ -580,7 +586,14 @@ def _few(
     return [few[(few["choice"] == name) & (few["number"] == n)] for name, n in (chosen, other)]
 
 
+def _failing(tables: Tables, method: str) -> int:
+    """Return on how many streets an ablation fails."""
+    runs = comparisons.of_method(tables.ablations, method, "thesis")
+    return ratios.failing_sequences(ratios.has_failed(runs).set_axis(runs["sequence"]))
+
+
 def _failed(runs: pd.DataFrame, street: str) -> str:
+    """Return how many runs over a street failed."""
     return ratios.count_failed(runs[runs["sequence"] == street])
 
 

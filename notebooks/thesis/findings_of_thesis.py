@@ -5,7 +5,7 @@ from typing import Any
 import pandas as pd
 
 from keypoint_study.report import findings, style, texts
-from thesis import artefacts, domain_gap
+from thesis import artefacts, map_quality
 from thesis.settings import Settings
 from thesis_repro.running.files import write_text
 
@@ -35,7 +35,7 @@ def write(
 
     compared: `comparisons_of` the runs.
     """
-    quality = domain_gap.label_map_quality(settings.build).round(3)
+    quality = map_quality.label_map_quality(settings.build).round(3)
     quality = quality.filter(["domain", "images", "classes", "mean_iou", "seen"])
     more = texts.render(
         "findings_of_thesis.md.j2",

@@ -8,7 +8,7 @@ from typing import Any
 import pandas as pd
 
 from keypoint_study.report import texts
-from thesis import audit_page, captions, timing
+from thesis import audit, captions, timing
 from thesis.reported import REPORTED
 from thesis.settings import ROOT, Settings, read_settings
 from thesis_repro.running import program, provenance
@@ -52,14 +52,14 @@ def write(settings: Settings) -> None:
     """
     audits = [settings.published / place / "audit.csv" for place in (".", REAL)]
     if settings.figures_in_git and all(path.is_file() for path in audits):
-        write_text(settings.published / "audit.md", audit(settings))
+        write_text(settings.published / "audit.md", page_of_audit(settings))
     write_text(settings.published / "README.md", text(settings))
 
 
-def audit(settings: Settings) -> str:
+def page_of_audit(settings: Settings) -> str:
     """Return the audit's page in git, made from the published tables."""
     folder = settings.published
-    return audit_page.text(folder, folder / REAL, settings.data_note)
+    return audit.page(folder, folder / REAL, settings.data_note)
 
 
 def text(settings: Settings) -> str:

@@ -1,4 +1,4 @@
-"""Controls, ablations, the null distribution of the thesis's procedure, and boundaries."""
+"""Controls, ablations and the null distribution of the thesis's procedure."""
 
 import inspect
 from dataclasses import replace
@@ -14,7 +14,6 @@ from keypoint_study.jobs import first_jobs, runs_of
 from keypoint_study.methods import Asked
 from keypoint_study.sources import Source
 from thesis import section_4_2
-from thesis.audit_runs import boundaries
 from thesis_repro import masks
 from thesis_repro.data.sequence import Sequence
 from thesis_repro.masks import folders
@@ -242,14 +241,3 @@ def test_the_half_that_the_camera_turns_into_is_kept(degrees, kept_half):
     )
     assert np.array_equal(other == 0, mask > 0) or kept_half == "both"
     assert ablations.half_in_turns(turning, True, 1).all()  # the last frame
-
-
-def test_boundaries_between_close_ids_are_lost_and_between_distant_ids_found():
-    label_map = np.full((320, 320), 7, np.uint8)
-    label_map[:, 160:] = 8
-    near = boundaries(label_map, (188, 620))
-    label_map[:, 160:] = 23
-    far = boundaries(label_map, (188, 620))
-    plain = boundaries(np.full_like(label_map, 20), (188, 620))
-    assert near["lost"] == 100
-    assert far["lost"] == 0 and np.isnan(plain["lost"])

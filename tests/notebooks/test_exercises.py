@@ -23,7 +23,7 @@ from scipy import stats
 
 import thesis_repro as tr
 from keypoint_study import comparisons
-from thesis import artefacts, audit_of_tables, earlier, section_4_2
+from thesis import artefacts, audit, earlier, section_4_2
 from thesis.settings import PREFIX, ROOT, read_settings
 from thesis_repro import masks
 from thesis_repro.data import cityscapes
@@ -445,7 +445,7 @@ def test_exercise_08_2(streets):
 
 
 def test_exercise_09_1():
-    changes = audit_of_tables.CHANGES["RMSE"]
+    changes = audit.CHANGES["RMSE"]
     ratio_of = run("09", "11", np=np, stats=stats)["ratio_of"]
     ends = [re.findall(r"[\d.]+", ratio_of(each))[-2:] for each in (changes, changes[changes < 0])]
     (low, high), (_, below) = (map(float, each) for each in ends)

@@ -8,7 +8,7 @@ import pytest
 from cells import NOTEBOOKS, code_of
 
 from keypoint_study.report import style
-from thesis import audit_page, captions, gallery
+from thesis import audit, captions, gallery
 from thesis.settings import ROOT, read_settings
 
 ARTEFACTS = [*captions.OF_THESIS, *captions.ADDED]
@@ -78,20 +78,20 @@ def test_the_gallery_in_git_is_made_from_what_is_in_git():
     missing = [link for link in links if not (ROOT / "figures" / link).is_file()]
     assert len(links) > 60 and missing == []
     assert gallery.REAL_CHAPTER in text  # two runs: real and rendered
-    assert (ROOT / "figures" / "audit.md").read_text() == gallery.audit(in_git)
+    assert (ROOT / "figures" / "audit.md").read_text() == gallery.page_of_audit(in_git)
 
 
 def test_the_audits_page_in_git_has_each_rows_words_once_and_both_runs_numbers():
     cells = {"where": "A.8", "the thesis or its code": "x", "what would be right": "y"}
     first = dict.fromkeys(("metric", "estimator", "unit", "low", "high"), "") | cells
     first |= {"row": "2", "switch": "z", "quantity": "sum", "value": "-13.20", "data": "this run"}
-    given = first | {"row": "10", "data": audit_page.ARITHMETIC}
+    given = first | {"row": "10", "data": audit.ARITHMETIC}
     more = first | {"quantity": "mean", "value": "0.5", "low": "0.25", "high": "1e0"}
     unmeasured = first | {"quantity": "", "value": "", "data": ""}
     runs = {"a": [first, given], "b": [unmeasured | {"row": "1"}, unmeasured, more, given]}
     tables = {name: pd.DataFrame(lines) for name, lines in runs.items()}
-    page = audit_page.side_by_side(tables)
-    shown = ["row", "where", "quantity", audit_page.ARITHMETIC, "a", "b"]
+    page = audit.side_by_side(tables)
+    shown = ["row", "where", "quantity", audit.ARITHMETIC, "a", "b"]
     assert page[shown].to_numpy().tolist() == [
         ["1", "A.8", "", "", "", ""],
         ["2", "A.8", "sum", "", "-13.2", ""],

@@ -12,17 +12,12 @@ import pytest
 
 from keypoint_study import comparisons
 from keypoint_study.report import style
-from thesis import (
-    audit,
-    audit_of_data,
-    audit_of_tables,
-    audit_runs,
-    domain_gap,
-    run,
-)
+from thesis import audit, audit_numbers, map_quality, run
 from thesis.settings import ROOT
 from thesis_repro.data.cityscapes import ID
 from thesis_repro.running import provenance
+
+FOLDERS = "figures", "figures/kitti_excerpts"
 
 
 def test_rows_are_numbered_and_every_measurement_has_a_row():
@@ -32,15 +27,22 @@ def test_rows_are_numbered_and_every_measurement_has_a_row():
         row[key].strip() for row in audit.ROWS for key in ("where", "does", "right", "switch")
     )
     with pytest.raises(KeyError, match="999"):
-        audit.audit_table(
-            [audit.measurement("13", "spread", 1), audit.measurement("999", "spread", 1)]
-        )
+        audit.measurement("999", "all", 1)
+
+
+def test_what_audit_json_calls_measured_has_a_number_in_git():
+    tables = [pd.read_csv(ROOT / folder / "audit.csv", dtype=str) for folder in FOLDERS]
+    measured = pd.concat(tables).dropna(subset="quantity")
+    on_one_thread = measured["quantity"].str.replace(r", \d+ threads$", "", regex=True)
+    in_git = {*zip(measured["row"], on_one_thread)}
+    named = {(row, text) for row, texts in audit.MEASURED.items() for text in texts.values()}
+    assert named == in_git
 
 
 def test_arithmetic_with_the_thesiss_tables_is_that_of_the_audit_in_git():
     in_git = pd.read_csv(ROOT / "figures/audit.csv", dtype={"row": str}, keep_default_na=False)
     in_git = in_git[in_git["data"] == "the thesis's numbers"]
-    made = audit.audit_table(audit_of_tables.of_reported())
+    made = audit.audit_table(audit_numbers.of_the_thesis())
     made = made[made["data"] == "the thesis's numbers"]
     named = ["row", "quantity", "metric"]
     assert made[named].to_numpy().tolist() == in_git[named].to_numpy().tolist()
@@ -48,7 +50,7 @@ def test_arithmetic_with_the_thesiss_tables_is_that_of_the_audit_in_git():
     assert made["value"].iloc[0] == -13.2  # printed in the thesis
 
 
-@pytest.mark.parametrize("folder", ["figures", "figures/kitti_excerpts"])
+@pytest.mark.parametrize("folder", FOLDERS)
 def test_the_audit_has_the_times_of_the_budget_beside_it(folder):
     rows = pd.read_csv(ROOT / folder / "audit.csv", dtype={"row": str})
     budget = pd.read_csv(ROOT / folder / "budget.csv", index_col="stage")
@@ -69,11 +71,11 @@ def test_ablations_become_ratios_of_their_reference():
         [f"{number:02d}" for number in range(8)],
         lambda _, method, __: factors[method],
         dict.fromkeys(factors, [None]),
-        estimators=audit_runs.COMPARED,
+        estimators=("thesis", "inliers", "refined"),
         noise=0.02,
     )
     runs = runs.assign(failed=1.0, sim3=runs["rmse"])
-    measurements = pd.DataFrame(audit_of_tables.of_ablations(runs))
+    measurements = pd.DataFrame(audit_numbers.of_ablations(runs))
     ratios = measurements[measurements["unit"] == "ratio"].set_index(
         ["row", "metric", "estimator"]
     )["value"]
@@ -96,7 +98,7 @@ def test_shares_of_pixels_are_means_over_the_sequences_with_their_number_of_fram
             "thin 5/15": np.nan,
         }
     )
-    rows = audit_of_tables.of_shares(shares)
+    rows = audit_numbers.of_shares(shares)
     assert {(row["quantity"], row["value"], row["n"], row["frames"]) for row in rows} == {
         ("boundary pixels lost", 30, 2, 2),
         ("accuracy on poles, lights, signs and people", 60, 1, 2),
@@ -105,12 +107,12 @@ def test_shares_of_pixels_are_means_over_the_sequences_with_their_number_of_fram
 
 def test_clear_effects_are_ratios_of_errors_whose_intervals_exclude_1():
     measurements = [
-        audit.ratio("10", "clear", [0.5, 0.6] * 3, metric="RMSE"),
-        audit.ratio("10", "unclear", [0.5, 2, 0.9, 1.1, 0.8, 1.2], metric="RMSE"),
-        audit.ratio("10", "no error", [0.5, 0.6] * 3, metric="keypoints"),
-        audit.ratio("14", "never below 1", [1.5, 1.6] * 3, metric="RMSE"),
+        audit.ratio("48", "orb", [0.5, 0.6] * 3, metric="RMSE"),
+        audit.ratio("59", "dropout", [0.5, 2, 0.9, 1.1, 0.8, 1.2], metric="RMSE"),
+        audit.ratio("70", "vegetation", [0.5, 0.6] * 3, metric="keypoints"),
+        audit.ratio("14", "shuffled", [1.5, 1.6] * 3, metric="RMSE"),
     ]
-    assert list(audit.clear_effects(audit.audit_table(measurements))["quantity"]) == ["clear"]
+    assert list(audit.clear_effects(audit.audit_table(measurements))["row"]) == ["48"]
 
 
 def test_right_pixels_are_counted_by_area():
@@ -121,11 +123,21 @@ def test_right_pixels_are_counted_by_area():
     predicted = exact.copy()
     predicted[15:, :15] = ID["car"]  # half of the shadow
     predicted[5:10, 20:22] = ID["car"]  # a fifth of the pole
-    shares = audit_of_data.right_shares(predicted, exact, frame)
+    shares = map_quality.right_shares(predicted, exact, frame)
     assert shares["small"] == 80 and shares["dark"] == 50 and shares["lit"] == 100
     assert shares["large"] == pytest.approx(100 * (1 - 75 / 1150))
     assert shares["inside"] > shares["rim"]
-    assert "small" not in audit_of_data.right_shares(predicted, np.full_like(exact, 7), frame)
+    assert "small" not in map_quality.right_shares(predicted, np.full_like(exact, 7), frame)
+
+
+def test_boundaries_between_close_ids_are_lost_and_between_distant_ids_found():
+    def found(left, right):
+        label_map = np.full((320, 320), left, np.uint8)
+        label_map[:, 160:] = right
+        return map_quality.found_boundaries(label_map, (188, 620), map_quality.EXACT)
+
+    assert found(7, 8) == 0 and found(7, 23) == 100
+    assert np.isnan(found(20, 20))
 
 
 def test_the_audit_and_the_comparison_answer_a_question_with_the_same_number():
@@ -140,7 +152,7 @@ def test_the_audit_and_the_comparison_answer_a_question_with_the_same_number():
     compared = table[table["tested"] & (table["reference"] == "baseline")].set_index(
         ["method", "estimator", "metric"]
     )
-    audited = pd.DataFrame(audit_of_tables.of_study(runs, runs[runs["method"] == "baseline"]))
+    audited = pd.DataFrame(audit_numbers.of_study(runs, runs[runs["method"] == "baseline"]))
     assert len(audited[audited["row"] == "39"]) == 2
     for row, method in (("15", "masked"), ("50", "corrected")):
         lines = audited[(audited["row"] == row) & (audited["metric"] == "RMSE")]
@@ -172,7 +184,7 @@ SCORES["IoU: sky"] = [0.7 if row.classes == 2 else float("nan") for row in SCORE
 
 
 def test_the_table_shows_each_model_and_domain():
-    table = domain_gap.table_of_scores(SCORES).set_index("measure")
+    table = map_quality.table_of_scores(SCORES).set_index("measure")
     assert list(table) == [
         f"{OWN}: {VALIDATION}",
         f"{OWN}: {STREETS}",
@@ -191,11 +203,11 @@ def test_the_table_shows_each_model_and_domain():
 
 
 def test_the_quality_of_label_maps_is_recorded(tmp_path):
-    assert domain_gap.label_map_quality(tmp_path).empty
+    assert map_quality.label_map_quality(tmp_path).empty
     style.save_table(
-        SCORES.assign(used=SCORES["model"] == SHIPPED), tmp_path, domain_gap.RECORD, "note"
+        SCORES.assign(used=SCORES["model"] == SHIPPED), tmp_path, map_quality.RECORD, "note"
     )
-    rows = domain_gap.label_map_quality(tmp_path).to_dict("records")
+    rows = map_quality.label_map_quality(tmp_path).to_dict("records")
     assert [
         (row["domain"], row["mean_iou"], row["classes"], row["images"], row["seen"]) for row in rows
     ] == [(VALIDATION, 0.5, 2, 20, False), (STREETS, 0.4, 2, 7, True)]
