@@ -297,6 +297,7 @@ class ResumableTraining(keras.callbacks.Callback):
 def load_model(path: str | Path) -> Any:
     """Load a model saved by Keras, `.keras` or HDF5, without loss and metrics.
 
+    A network of 16 bits, as trained with a mixed policy, computes in 32 here.
     Code in the file is never executed: Keras' safe mode refuses it, and all layers that are not
     Keras' own. The classes may be any up to 256; those of the thesis's network are Cityscapes' ids.
     Raises InputError if the file is missing, truncated, no model, or holds code, if its weights are
@@ -326,7 +327,17 @@ def load_model(path: str | Path) -> Any:
             f"{path}: has weights that are no finite numbers, because its training broke; train it again, "
             "or name another model"
         )
+    if any(layer.compute_dtype in ("float16", "bfloat16") for layer in model._flatten_layers()):
+        # processors may lack convolutions of 16 bits
+        weights = model.get_weights()
+        model = keras.models.clone_model(model, clone_function=_in_32_bits, recursive=True)
+        model.set_weights(weights)
     return same_bits(model)
+
+
+def _in_32_bits(layer: Any) -> Any:
+    """Return a fresh copy of a layer that computes in 32 bits."""
+    return type(layer).from_config(layer.get_config() | {"dtype": "float32"})
 
 
 def _refusal(error: Exception) -> str:
