@@ -176,18 +176,18 @@ def claim(name: str) -> claims.Claim:
 
 
 def equal(chosen: str, other: str, estimator: str = "refined") -> dict[str, Any]:
-    """Return two choices at an equal number: {se3, rotation (typical ratios), failing, hangs}.
+    """Return two choices at an equal number: {se3, rotation (typical ratios), verdict, ...}.
 
-    chosen, other: of `equal_number.PAIRS`, or all on the mask and all keypoints. hangs: of
-    `equal_number.hangs_on`. failing: of both, the streets on which half of the runs fail.
+    chosen, other: of `equal_number.PAIRS`. hangs: of `equal_number.hangs_on`. failing: of both, the
+    streets on which half of the runs fail.
     """
     few_runs, runs = read_table(f"{REAL}few_keypoints_runs"), read_table(f"{REAL}runs")
     sides = equal_number.of_pair(few_runs, runs, (chosen, other), estimator)
     of_streets = equal_number.over(*sides)
     typical = {name: ratios.typical_ratio(of_streets[name]) for name in of_streets}
-    hangs = equal_number.hangs_on(of_streets)
+    told = {"verdict": equal_number.word(of_streets), "hangs": equal_number.hangs_on(of_streets)}
     failed = [streets(equal_number.failing(side)) for side in sides]
-    return {**typical, "hangs": hangs, "failing": failed}
+    return {**typical, **told, "failing": failed}
 
 
 def commands() -> dict[str, Any]:

@@ -21,26 +21,33 @@ from keypoint_study.verdicts import verdict
 
 DECIDING = comparisons.JUDGING_METRICS
 SHOWN = {"thesis": "thesis's estimator", "refined": "refined estimator"}
-# choice and number of keypoints (0: no limit), and those of what it is compared with
-PAIRS = {
-    ("200 strongest on the mask", "200 random ones"): (("mask", 200), ("random", 200)),
-    ("200 random ones on the mask", "200 random ones"): (("random-on", 200), ("random", 200)),
-    ("100 strongest on the mask", "100 random ones"): (("mask", 100), ("random", 100)),
-    ("200 strongest on the mask", "200 strongest"): (("mask", 200), ("strongest", 200)),
-    ("200 strongest", "200 random ones"): (("strongest", 200), ("random", 200)),
-    ("200 spread", "200 random ones"): (("spread", 200), ("random", 200)),
-    ("200 spread", "200 strongest"): (("spread", 200), ("strongest", 200)),
-    ("the mask, filled", "the mask"): (("filled", 0), ("mask", 0)),
-}
 MASKS, EVERY = "all on the mask", "all keypoints"  # the comparison of the main study
-DRAWN = {
-    "200 spread over the frame": ("spread", 200),
+# {title: choice and number of keypoints, 0 for no limit}; the first six are drawn
+CHOICES = {
+    "200 spread": ("spread", 200),
     "200 random ones": ("random", 200),
     "200 strongest": ("strongest", 200),
     "200 strongest on the mask": ("mask", 200),
-    "all on the mask": ("mask", 0),
+    "the mask": ("mask", 0),
     "the mask, filled": ("filled", 0),
+    "200 random ones on the mask": ("random-on", 200),
+    "100 strongest on the mask": ("mask", 100),
+    "100 random ones": ("random", 100),
 }
+DRAWN = 6
+CALLED = {"200 spread": "200 spread over the frame", "the mask": MASKS}  # in the figure
+# titles of CHOICES, the second being what the first is compared with; or (MASKS, EVERY)
+PAIRS = (
+    ("200 strongest on the mask", "200 random ones"),
+    ("200 random ones on the mask", "200 random ones"),
+    ("100 strongest on the mask", "100 random ones"),
+    ("200 strongest on the mask", "200 strongest"),
+    ("200 strongest", "200 random ones"),
+    ("200 spread", "200 random ones"),
+    ("200 spread", "200 strongest"),
+    ("the mask, filled", "the mask"),
+    (MASKS, EVERY),
+)
 REACH = 8  # of the figure's axis, from 1 / REACH to REACH
 # on which the streets were recorded (KITTI's raw data; its odometry kit names the drives)
 DAYS = {
@@ -60,7 +67,7 @@ def over(chosen: pd.DataFrame, reference: pd.DataFrame) -> pd.DataFrame:
 def of_pair(
     few: pd.DataFrame, runs: pd.DataFrame, pair: tuple[str, str], estimator: str
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Return the runs of both sides of a pair: of PAIRS, or (MASKS, EVERY).
+    """Return the runs of both sides of one of PAIRS.
 
     few: of `few_keypoints.run_few`. runs: of notebook 8, whose masks have one tested width.
     """
@@ -69,9 +76,14 @@ def of_pair(
         width = comparisons.tested_width(runs)
         masks = runs[(runs["method"] == "masked") & (runs["dilation_width"] == width)]
         return masks, runs[runs["method"] == "baseline"]
-    sides = PAIRS[pair]
-    first, second = (few[(few["choice"] == name) & (few["number"] == n)] for name, n in sides)
+    first, second = (of_choice(few, title) for title in pair)
     return first, second
+
+
+def of_choice(few: pd.DataFrame, title: str) -> pd.DataFrame:
+    """Return the runs of one of CHOICES."""
+    choice, number = CHOICES[title]
+    return few[(few["choice"] == choice) & (few["number"] == number)]
 
 
 def word(of_streets: pd.DataFrame, ends: tuple[str, str] = ("low", "high")) -> str:
@@ -81,28 +93,28 @@ def word(of_streets: pd.DataFrame, ends: tuple[str, str] = ("low", "high")) -> s
     return verdict(len(of_streets), sides)
 
 
-def hangs_on(of_streets: pd.DataFrame) -> dict[str, Any]:
-    """Return the verdict on both errors, and where it is another one.
+def hangs_on(of_streets: pd.DataFrame) -> str:
+    """Return without what the verdict on both errors is another one: "two streets (1 of 55)".
 
-    of_streets: of `over`.
-    {verdict; one, two, day: (number of cases left out without a change, number of cases); old: the
-    verdict without NEW; easy: without HARD; student: with Student's t}
+    of_streets: of `over`. "nothing" if it stays everywhere.
     """
-    streets, told = list(of_streets.index), word(of_streets)
-
-    def stays(cases: list[Collection[str]]) -> tuple[int, int]:
-        without = [word(of_streets.drop([*set(case) & set(streets)])) for case in cases]
-        return without.count(told), len(cases)
-
-    return {
-        "verdict": told,
-        "one": stays([[street] for street in streets]),
-        "two": stays([*combinations(streets, 2)]),
-        "day": stays([*DAYS.values()]),
-        "old": word(of_streets.drop([*set(NEW) & set(streets)])),
-        "easy": word(of_streets.drop([*set(HARD) & set(streets)])),
-        "student": word(of_streets, ("mean_low", "mean_high")),
+    told, found = word(of_streets), []
+    streets = list(of_streets.index)
+    cases: dict[str, list[Collection[str]]] = {
+        "one street": [[street] for street in streets],
+        "two streets": [*combinations(streets, 2)],
+        "a day": [*DAYS.values()],
+        "the new streets": [NEW],
+        ", ".join(HARD): [HARD],
     }
+    for name, left_out in cases.items():
+        words = [word(of_streets.drop([*case], errors="ignore")) for case in left_out]
+        others = len(words) - words.count(told)
+        if others:
+            found.append(f"{name} ({others} of {len(words)})" if len(words) > 1 else name)
+    if word(of_streets, ("mean_low", "mean_high")) != told:
+        found.append("the signed rank")
+    return "; ".join(found) or "nothing"
 
 
 def failing(runs: pd.DataFrame) -> str:
@@ -114,7 +126,7 @@ def failing(runs: pd.DataFrame) -> str:
 def table_of_pairs(few: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
     """Return one row a pair and estimator, for readers."""
     lines = []
-    for pair in [*PAIRS, (MASKS, EVERY)]:
+    for pair in PAIRS:
         for estimator, title in SHOWN.items():
             sides = of_pair(few, runs, pair, estimator)
             of_streets = over(*sides)
@@ -124,14 +136,8 @@ def table_of_pairs(few: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
                 line[error] = (
                     f"{texts.short(typical)}, {typical['above']} of {typical['n']} above 1"
                 )
-            found = hangs_on(of_streets)
-            line["both errors"] = found["verdict"]
-            for case in ("one", "two", "day"):
-                name = {"one": "any one street", "two": "any two", "day": "a day"}[case]
-                line[f"the same without {name}"] = "{} of {}".format(*found[case])
-            line["without the new streets"] = found["old"]
-            line[f"without {', '.join(HARD)}"] = found["easy"]
-            line["with Student's t"] = found["student"]
+            line["both errors"] = word(of_streets)
+            line["hangs on"] = hangs_on(of_streets)
             line["streets that fail"] = ", ".join(map(failing, sides))
             lines.append(line)
     return pd.DataFrame(lines)
@@ -156,13 +162,14 @@ def share_of_days(of_streets: pd.Series) -> float:
 def figure_of_choices(few: pd.DataFrame) -> Figure:
     """Draw the errors of six choices of keypoints, over those of all, with both estimators."""
     drawing, panels = style.new_figure(1, len(DECIDING), 2.6, sharex=True, sharey=True)
+    drawn = list(CHOICES)[:DRAWN]
     looks = {"thesis": (style.BLUE, -0.15), "refined": (style.RED, 0.15)}
     for panel, error in zip(panels, DECIDING, strict=True):
         for estimator, (color, aside) in looks.items():
             runs = few[few["estimator"] == estimator]
             every = runs[runs["choice"] == "all"]
-            for place, (choice, number) in enumerate(DRAWN.values()):
-                chosen = runs[(runs["choice"] == choice) & (runs["number"] == number)]
+            for place, title in enumerate(drawn):
+                chosen = of_choice(runs, title)
                 typical = ratios.typical_ratio(ratios.ratios_of(chosen, every, error))
                 ends = np.clip([typical["low"], typical["high"]], 1 / REACH, REACH)
                 look = style.interval_style(color)
@@ -170,7 +177,7 @@ def figure_of_choices(few: pd.DataFrame) -> Figure:
                 label = SHOWN[estimator] if not place else None
                 mark = {"color": color, "markersize": 4, "label": label}
                 panel.plot(typical["ratio"], place + aside, "D", **mark)
-        style.ratio_rows(panel, list(DRAWN), REACH)
+        style.ratio_rows(panel, [CALLED.get(title, title) for title in drawn], REACH)
         panel.set_title(ERRORS[error].plainly)
         panel.set_xlabel("divided by that of all keypoints", fontsize=8)
     style.legend_below(drawing, panels[:1], 2)

@@ -17,28 +17,25 @@ def table(of_street):
 
 
 def test_a_verdict_of_all_streets_hangs_on_none():
-    found = equal_number.hangs_on(table({}))
-    assert found == {
-        "verdict": verdicts.HIGHER,
-        "one": (11, 11),
-        "two": (55, 55),
-        "day": (3, 3),
-        "old": verdicts.HIGHER,
-        "easy": verdicts.HIGHER,
-        "student": verdicts.HIGHER,
-    }
+    of_streets = table({})
+    assert equal_number.word(of_streets) == verdicts.HIGHER
+    assert equal_number.hangs_on(of_streets) == "nothing"
 
 
 def test_a_verdict_that_hangs_on_streets_says_so():
     """Two streets of one day hold against all others, so one pair and one day decide."""
-    found = equal_number.hangs_on(table({"05": 0.5, "06": 0.55}))
-    assert found["verdict"] == found["old"] == verdicts.NO_CLEAR_DIFFERENCE
-    assert (found["one"], found["two"], found["day"]) == ((11, 11), (54, 55), (2, 3))
+    of_streets = table({"05": 0.5, "06": 0.55})
+    assert equal_number.word(of_streets) == verdicts.NO_CLEAR_DIFFERENCE
+    assert equal_number.hangs_on(of_streets) == "two streets (1 of 55); a day (1 of 3)"
+    new = table(dict.fromkeys(equal_number.NEW, 0.5))
+    assert "the new streets" in equal_number.hangs_on(new)
+    one_far_off = table({street: 1.01 for street in STREETS} | {"01": 99.0})
+    assert equal_number.hangs_on(one_far_off) == "the signed rank"
 
 
 def test_fewer_than_six_streets_tell_nothing():
-    found = equal_number.hangs_on(table({}).iloc[:5])
-    assert found["verdict"] == verdicts.TOO_FEW and found["one"] == (5, 5)
+    assert equal_number.word(table({}).iloc[:5]) == verdicts.TOO_FEW
+    assert equal_number.hangs_on(table({}).iloc[:6]).startswith("one street (6 of 6); ")
 
 
 def test_half_of_the_runs_make_a_street_fail():
