@@ -40,6 +40,7 @@ CODE = (
     "thesis_repro/odometry",
     "thesis_repro/masks",
     "thesis_repro/data",
+    "thesis_repro/running/files.py",
     "opencv_exact",
     "keypoint_study/ablations.py",
     "keypoint_study/controls.py",
