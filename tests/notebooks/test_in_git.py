@@ -10,6 +10,7 @@ import pytest
 from cells import NOTEBOOKS, code_of, named
 from nbconvert import ScriptExporter
 
+from thesis import run
 from thesis.settings import ROOT
 
 LOOP = "def path_by_hand("  # the one cell that may be longer
@@ -57,18 +58,13 @@ def test_notebooks_in_git_are_valid_and_python_and_have_no_outputs(name):
     assert ScriptExporter().from_filename(path)[1]["output_extension"] == ".py"
 
 
-def test_the_makefile_lists_the_notebooks_that_each_one_needs():
-    makefile = (ROOT / "Makefile").read_text()
-    rule = r"^\$\(call executed,([\d ]+)\): \$\(call executed,([\d ]+)\)"
-    needs = {name[:2]: set() for name in NOTEBOOKS}
-    for numbers, needed in re.findall(rule, makefile, re.MULTILINE):
-        for number in numbers.split():
-            needs[number] |= set(needed.split())
-    for number in sorted(needs):  # a notebook needs only earlier ones, whose needs are complete
-        needs[number] = needs[number].union(*(needs[other] for other in needs[number]))
+def test_a_notebook_reads_only_what_those_that_it_needs_have_written():
+    needs = {}
+    for name, direct in run.NEEDS.items():  # in order: what is needed is complete
+        needs[name] = set(direct).union(*(needs[other] for other in direct))
     for name in NOTEBOOKS:
-        read = re.findall(r'"(\d\d)_\w+"', code_of(name))
-        assert set(read) <= needs[name[:2]], name
+        read = re.findall(r'"(\d\d_\w+)"', code_of(name))
+        assert set(read) <= needs[name.removesuffix(".ipynb")], name
 
 
 def called_names(code):
