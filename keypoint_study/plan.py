@@ -1,7 +1,7 @@
 """A study with your own masks: its settings, the check of its input, and its runs."""
 
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -67,35 +67,19 @@ class Study:
         Raises InputError for a folder with results of another number of frames, and if the true
         poses of a sequence fit better inverted.
         """
-        settings = {"scale_gate": self.scale_gate}
-        runs_of = partial(
-            jobs.runs_of,
-            sequences=self.opened,
-            sources=self.sources,
-            settings=settings,
-            masked_settings=self.masked_settings,
-        )
-        run_all = partial(
-            runner.run_all, folder=folder / RUNS, processes=processes, scheduler=scheduler
-        )
+        settings = {"scale_gate": self.scale_gate, **self.masked_settings}
+        where: dict[str, Any] = {"processes": processes, "scheduler": scheduler}
         with provenance.claimed(folder):
-            provenance.stage(
-                folder,
-                replace=False,
-                frames=self.frames,
-                **settings,
-                **self.masked_settings,
+            provenance.stage(folder, replace=False, frames=self.frames, **settings)
+            listed = jobs.first_jobs(
+                self.opened,
+                dict.fromkeys(self.estimators, self.widths),
+                tested=self.tested,
+                sources=self.sources,
+                repetitions=self.repetitions,
             )
-            runs = runs_of(
-                jobs.first_jobs(
-                    self.opened,
-                    dict.fromkeys(self.estimators, self.widths),
-                    tested=self.tested,
-                    sources=self.sources,
-                    repetitions=self.repetitions,
-                )
-            )
-            outcome = first = run_all(runs)
+            runs = self._runs_of(listed)
+            outcome = first = runner.run_all(runs, folder / RUNS, **where)
             if (first.table["method"] == "baseline").all():
                 raise InputError(
                     "every run but those with all keypoints failed (see above), so there is nothing to "
@@ -112,9 +96,15 @@ class Study:
                     self.estimators,
                 )
                 done = {job: run for job, run in runs.items() if job not in first.reasons}
-                outcome = run_all(done | runs_of(as_many)).after(first)
+                both = done | self._runs_of(as_many)
+                outcome = runner.run_all(both, folder / RUNS, **where).after(first)
         numbers = runner.number_warnings(outcome.table, self.sources)
         return replace(outcome, warnings=[*outcome.warnings, *numbers])
+
+    def _runs_of(self, listed: list[jobs.Job]) -> dict[jobs.Job, jobs.Run | str]:
+        """Return the runs of jobs with the settings of the study."""
+        settings = {"scale_gate": self.scale_gate}
+        return jobs.runs_of(listed, self.opened, self.sources, settings, self.masked_settings)
 
     def _check_truths(self, table: pd.DataFrame, folder: Path) -> None:
         """Raise InputError if a truth fits the paths of every estimator better inverted."""

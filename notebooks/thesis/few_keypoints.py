@@ -37,16 +37,6 @@ TIMED_RUNS = 5
 CALLED = {"baseline": "all", "strongest-on": "mask", "spread-anywhere": "spread"}
 # {name in the tables: title}
 LABELS = {CALLED.get(name, name): METHODS[name].title for name in ("baseline", *of_group(FEW))}
-COLUMNS = (
-    "sequence",
-    "choice",
-    "number",
-    "estimator",
-    "repetition",
-    "keypoints",
-    *comparisons.JUDGING_METRICS,
-    "failed",
-)
 # choices and numbers that are run with every second frame, too
 EVERY_SECOND = (("all", 0), ("mask", 0), ("spread", 200))
 NEAR = 0.8, 1.5  # of the panels that show ratios near 1 enlarged
@@ -67,16 +57,6 @@ def jobs_of(sequence: Sequence, numbers: Iterable[int] = ()) -> dict[tuple[str, 
         (CALLED.get(name, name), number): Job(sequence.name, name, max_keypoints=number)
         for name, number in asked
     }
-
-
-def choices(sequence: Sequence, labels: Path) -> dict[tuple[str, int], tuple]:
-    """Return {(choice, number): (settings, masks)} of NUMBERS, see `jobs_of`.
-
-    labels: a folder with one folder of label maps a sequence.
-    """
-    listed = jobs_of(sequence)
-    runs: dict[Job, Any] = runs_of(listed.values(), [sequence], [Source(labels)])
-    return {key: (runs[job].settings, runs[job].masks) for key, job in listed.items()}
 
 
 def run_few(
@@ -102,12 +82,14 @@ def run_few(
     ]
     runs = runs_of(repeated(listed, COMPARED, repetitions), sequences, [Source(labels)])
     table = run_all(runs, folder, processes=processes).table
-    return table.assign(
+    table = table.assign(
         choice=table["method"].replace(CALLED),
         number=table["max_keypoints"],
         keypoints=table["mean_keypoints"],
         failed=ratios.has_failed(table).astype(int),
-    )[list(COLUMNS)]
+    )
+    what = ["sequence", "choice", "number", "estimator", "repetition", "keypoints"]
+    return table[[*what, *comparisons.JUDGING_METRICS, "failed"]]
 
 
 def time_steps(sequence: Sequence, labels: Path, frames: int = 40) -> pd.DataFrame:
@@ -119,11 +101,12 @@ def time_steps(sequence: Sequence, labels: Path, frames: int = 40) -> pd.DataFra
     """
     cv2.setNumThreads(1)
     excerpt = sequence.subset(frames)
-    timed = {key: run for key, run in choices(excerpt, labels).items() if key[0] != "random"}
+    timed = {key: job for key, job in jobs_of(excerpt).items() if key[0] != "random"}
+    runs: dict[Job, Any] = runs_of(timed.values(), [excerpt], [Source(labels)])
     least = dict.fromkeys(timed, np.inf)
-    for _, (key, (settings, masks)) in product(range(TIMED_RUNS), timed.items()):
+    for _, (key, job) in product(range(TIMED_RUNS), timed.items()):
         start = process_time()
-        odometry.run(excerpt, settings, masks)
+        odometry.run(excerpt, runs[job].settings, runs[job].masks)
         least[key] = min(least[key], process_time() - start)
     # whole milliseconds: repeated measurements differ by more than one
     times = (1000 * pd.Series(least) / len(excerpt)).round().astype(int)
