@@ -44,7 +44,7 @@ help:
 	@echo "make evidence    make figures PROFILE=thesis from KITTI=build/excerpts, and keep what shows no frame; from other"
 	@echo "                 frames, elsewhere (whole sequences take hours; FRAMES=00:0-129,04:0-37 takes parts of sequences)"
 	@echo "make timings     after make figures, or make evidence KITTI=build/excerpts: measure the times of their figures anew"
-	@echo "make bench       measure the relative cost of odometry and network (KITTI=/path), into build/bench.json"
+	@echo "make bench       measure the relative cost of the odometry (KITTI=/path), into build/bench.json"
 	@echo "make setup       install the pinned packages into .venv (GPU=1: and CUDA)"
 	@echo "make clean       delete .venv and all results"
 
@@ -113,7 +113,7 @@ lab: setup
 	  $(if $(LISTEN),--ip=$(LISTEN) --no-browser) $(if $(filter 0,$(shell id -u)),--allow-root)
 bench: setup
 	@$(if $(KITTI),,$(BIN)/python -m thesis_repro synthesize build/world-demo)
-	@$(BIN)/python tools/bench.py --kitti "$${THESIS_REPRO_KITTI:-build/world-demo/kitti}"
+	@$(BIN)/python tools/bench.py "$${THESIS_REPRO_KITTI:-build/world-demo/kitti}"
 excerpts: setup
 	@$(BIN)/python tools/excerpts.py "$(KITTI)" "$(RAW)"
 evidence: setup
