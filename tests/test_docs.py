@@ -17,6 +17,7 @@ import thesis_repro as tr
 from thesis.settings import ROOT
 from thesis_repro.command import cli
 from thesis_repro.command.options import build_parser
+from thesis_repro.data.cameras import read_camera
 from thesis_repro.data.trajectories import read_poses, read_poses_at
 from thesis_repro.masks import KINDS
 from thesis_repro.odometry.estimators import ESTIMATORS
@@ -112,7 +113,7 @@ def examples(small_world, tmp_path, monkeypatch):
 
 
 def test_the_recipes_for_what_people_bring_run(examples, tmp_path):
-    images, (memory, network, whole, kept, live, step, detectors, own, video) = examples
+    images, (memory, network, whole, kept, live, step, detectors, own, video, _) = examples
     short = memory, whole, kept, live, step, detectors, video
     assert max(recipe["lines"] for recipe in short) <= 15
 
@@ -156,9 +157,13 @@ def test_the_recipes_for_what_people_bring_run(examples, tmp_path):
     np.testing.assert_allclose(times, np.arange(len(images)) / 25)
     assert first.ndim == 2 and first.dtype == np.uint8
 
+    camera = read_camera("sensor.yaml")
+    assert camera.matrix[0, 0] == 458.7 and camera.distortion[3] == 0.00002
+    assert np.array_equal(camera.body[:3, 3], [-0.02, -0.06, 0.01])
+
 
 def test_points_that_leave_the_frame_are_not_found_by_the_recipe_for_own_matches(examples):
-    images, (*_, own, _) = examples
+    images, (*_, own, _, _) = examples
     frames = [image[..., 0] for image in images[:2]]
     height, width = frames[0].shape
     ends = [[-3, 9], [width, 9], [9, -3], [9, height], [0, 0], [width - 1, height - 1]]

@@ -84,7 +84,7 @@ def cut(
         raise InputError(
             f"{sequence.folder}: has {len(sequence)} frames; {first} to {last} are wanted"
         )
-    if sequence.distortion.any():
+    if sequence.lens.distortion.any():
         raise InputError(f"{sequence.folder}: has distortion; only KITTI's frames are cut")
     folder = root / "sequences" / name
     projection = np.column_stack([sequence.intrinsics, np.zeros(3)])

@@ -169,14 +169,9 @@ def test_label_maps_written_again_give_new_masks(labelled, tmp_path):
         assert all(np.array_equal(written[index], expected) for index in range(4))
 
 
-@pytest.mark.parametrize(
-    "stems, mask",
-    [("abcd", "c.png"), ("abcd", "c.png.png")],
-)
-def test_a_mask_named_as_a_frame_is_that_frames(tiny_kitti, tmp_path, stems, mask):
-    for path, stem in zip(sorted(tiny_kitti.rglob("image_0/*")), stems, strict=True):
-        path.rename(path.with_name(f"{stem}.png"))
+def test_a_mask_named_as_a_frame_is_that_frames(tiny_kitti, tmp_path):
     sequence, folder = Sequence(tiny_kitti, "00"), tmp_path / "masks"
+    mask = sequence.label_names[2]
     folder.mkdir()
     cv2.imwrite(str(folder / mask), np.full((48, 64), 255, np.uint8))
     for frames in (sequence, sequence.subset(2)):

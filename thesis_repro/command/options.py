@@ -154,9 +154,8 @@ SHARED: dict[str, dict[str, Any]] = {
     "--calibration": dict(
         type=path,
         metavar="FILE",
-        help="camera with distortion, which is taken out: fx fy cx cy k1 k2 p1 p2 (the first four are enough), a "
-        "camera matrix, or YAML of OpenCV, ROS, EuRoC, Kalibr, OKVIS, VINS-Fusion or ORB-SLAM (that of the "
-        "layout, such as calib.txt)",
+        help="camera with distortion, which is taken out: fx fy cx cy k1 k2 p1 p2 (the first four are enough), or "
+        "YAML of OpenCV, ROS, EuRoC or Kalibr (that of the layout, such as calib.txt)",
     ),
 }
 SEQUENCE = ("--kitti", "--sequence", "--camera", "--calibration", "--frames")

@@ -1,10 +1,8 @@
-"""Frames in folders: in which order, of which times and bits, and what else a layout finds."""
+"""Frames in folders: in which order, of which bits, and what else a layout finds."""
 
 import re
 from collections.abc import Callable
-from decimal import Decimal
 from functools import cache
-from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,21 +15,9 @@ from thesis_repro.errors import InputError
 from thesis_repro.running import program
 from thesis_repro.running.files import images, read_gray
 
-DECIMAL = re.compile(r"\d+\.\d+")  # names of frames that may be seconds
-# Times since 1970 in names, with words before or after, and their unit in seconds. Of two numbers,
-# the second one has 3 or 6 decimals in all names, or is nanoseconds without leading zeros.
-EPOCH_NAMES = {
-    r"1\d{18}": 1e-9,
-    r"1\d{15}": 1e-6,
-    r"1\d{12}": 1e-3,
-    r"1\d{9}\.(?:\d{3}|\d{6}|\d{9})": 1,
-    r"1\d{9}[_-]\d{1,9}": 1,
-}
-MAX_KINDS = 4  # of pictures in one folder; hexadecimal numbers look like more
-SHARED_NUMBERS = 0.6  # numbers a frame, or fewer, if most frames are there twice
+DECIMAL = re.compile(r"\d+\.\d+")  # names of frames that are numbers with a dot
 # A 16-bit frame has hot pixels if its maximum is HOT times what all but 0.1 % stay below.
 HOT, USUAL = 2, 99.9
-FEW_LEVELS = 32  # of 256
 
 
 class Files(NamedTuple):
@@ -74,80 +60,19 @@ def camera_folder(
 def frames_in(folder: Path) -> list[Path]:
     """Images of a folder in the order of their numbers.
 
-    Names such as 0.15 and 0.2, which differ in their number of decimals, are decimal numbers, or
-    seconds and nanoseconds without leading zeros. Raises InputError if they may be both, in
-    different orders, if there are no images, and if there are left and right ones.
+    Raises InputError if there are none, and for names such as 0.15 and 0.2, which may be decimal
+    numbers, or seconds and nanoseconds.
     """
     paths = images(folder)
     if not paths:
         raise InputError(f"{folder}: holds no PNG or JPEG images")
-    _check_kinds(folder, paths)
-    parts = [path.stem.split(".") for path in paths if DECIMAL.fullmatch(path.stem)]
-    fractions = [fraction for _, fraction in parts]
-    if len(parts) < len(paths) or len(set(map(len, fractions))) < 2:
-        return paths
-    by_value = sorted(paths, key=lambda path: Decimal(path.stem))
-    by_nanoseconds = sorted(paths, key=lambda path: _nanoseconds(path.stem))
-    form, ordered = "decimal numbers", by_value
-    if _may_be_nanoseconds(by_nanoseconds, fractions):
-        # decimals without their last zeros do not end with a zero
-        if any(len(fraction) > 1 and fraction.endswith("0") for fraction in fractions):
-            form, ordered = "seconds and nanoseconds", by_nanoseconds
-        elif by_value != by_nanoseconds:
-            raise InputError(
-                f"{folder}: {paths[0].name} and the like may be decimal numbers, or seconds and nanoseconds, "
-                "in different orders; rename the frames so that all have as many digits after the dot"
-            )
-    say_once(
-        f"{folder}: frames are in the order of their names as {form}, {ordered[0].stem} to "
-        f"{ordered[-1].stem}"
-    )
-    return ordered
-
-
-def _check_kinds(folder: Path, paths: list[Path]) -> None:
-    """Raise InputError if pictures of two kinds, such as left and right, have the same numbers."""
-    kinds = {re.sub(r"\d+", "*", path.name) for path in paths}
-    numbers = {tuple(re.findall(r"\d+", path.stem)) for path in paths}
-    numbered = () not in numbers
-    if numbered and 2 <= len(kinds) <= MAX_KINDS and len(numbers) <= SHARED_NUMBERS * len(paths):
+    digits = {len(path.stem.split(".")[1]) for path in paths if DECIMAL.fullmatch(path.stem)}
+    if len(digits) > 1:
         raise InputError(
-            f"{folder}: holds {' and '.join(sorted(kinds))} with the same numbers; move all but one "
-            "camera's frames away"
+            f"{folder}: {paths[0].name} and others have {' and '.join(map(str, sorted(digits)))} digits "
+            "after the dot, so their order is not known; rename them so that all have as many"
         )
-
-
-def _nanoseconds(stem: str) -> int:
-    seconds, fraction = stem.split(".")
-    return int(seconds) * 10**9 + int(fraction)
-
-
-def _may_be_nanoseconds(ordered: list[Path], fractions: list[str]) -> bool:
-    """Whether names may be seconds and nanoseconds without leading zeros.
-
-    ordered: the frames in the order of these times, of which no camera makes more than 100,000 a
-    second.
-    """
-    times = [_nanoseconds(path.stem) for path in ordered]
-    is_slow = all(later - time >= 10_000 for time, later in pairwise(times))
-    has_no_zeros = not any(len(text) > 1 and text.startswith("0") for text in fractions)
-    return is_slow and has_no_zeros and max(map(len, fractions)) <= 9
-
-
-def times_in_names(paths: list[Path]) -> np.ndarray | None:
-    """Times of frames, (n,), seconds, if their names hold times since 1970 that increase."""
-    for form, unit in EPOCH_NAMES.items():
-        found = [re.fullmatch(rf"(?:.*\D)??({form})(?:\D.*)?", path.stem) for path in paths]
-        if not all(found):
-            continue
-        words = [re.split("[_-]", match[1]) for match in found if match]
-        times = unit * np.array([word[0] for word in words], np.float64)
-        if len(words[0]) > 1:
-            digits = {len(word[1]) for word in words}
-            decimals = digits.pop() if digits in ({3}, {6}) else 9
-            times += 10.0**-decimals * np.array([word[1] for word in words], np.float64)
-        return times if (np.diff(times) > 0).all() else None
-    return None
+    return paths
 
 
 @cache
@@ -172,14 +97,7 @@ def white_level(path: Path) -> int:
     origin = "the first one's maximum"
     if white > HOT * max(usual, 1):
         white, origin = max(usual, 1), f"what {USUAL} % of the first one's pixels do not exceed"
-    levels = round(255 * (1 - np.percentile(first, 100 - USUAL) / white))
-    line = f"{path.parent}: frames have 16 bits; {white}, {origin}, is white"
-    if levels < FEW_LEVELS:
-        line += (
-            f"; that leaves {levels} gray levels, so frames may be flagged as flat: write them with "
-            "8 bits, from the darkest to the brightest"
-        )
-    say_once(line, levels < FEW_LEVELS)
+    say_once(f"{path.parent}: frames have 16 bits; {white}, {origin}, is white")
     return white
 
 

@@ -1,7 +1,7 @@
 """A sequence: frames, camera, times and ground truth, in any of the layouts of `layout.LAYOUTS`."""
 
 import operator
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from copy import copy
 from functools import cached_property, partial
 from pathlib import Path
@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from thesis_repro.data import cameras, layout
-from thesis_repro.data.frames import eight_bits, say_once, times_in_names, white_level
+from thesis_repro.data.frames import Files, eight_bits, say_once, white_level
 from thesis_repro.data.geometry import check_camera
 from thesis_repro.data.memory import FRAME_TIME, ArraySequence, distances, step_lengths
 from thesis_repro.data.trajectories import WITHIN, read_truth
@@ -26,11 +26,11 @@ MARGIN = 10
 class Sequence:
     """A sequence in one of the layouts of `layout.LAYOUTS`, or a folder of own frames.
 
-    Frames are PNG or JPEG files. Colour frames are read as gray. Without a file of times, and
-    without times in the names of the frames, `times` assumes ten frames a second, as in KITTI.
-    Without a file of poses, `has_truth` is False. KITTI's ground truth belongs to the left gray
-    camera; the left colour camera is 6 cm beside it. The constructor reads and checks all files
-    except the frames. Raises InputError, naming the file, if a file is missing or malformed.
+    Frames are PNG or JPEG files. Colour frames are read as gray. Without a file of times, `times`
+    assumes ten frames a second, as in KITTI. Without a file of poses, `has_truth` is False. KITTI's
+    ground truth belongs to the left gray camera; the left colour camera is 6 cm beside it. The
+    constructor reads and checks all files except the frames. Raises InputError, naming the file, if
+    a file is missing or malformed.
 
     `Sequence.from_arrays(frames, intrinsics, ...)` is for frames in memory.
     """
@@ -60,110 +60,41 @@ class Sequence:
         distortion is taken out of the frames. truth_within: seconds between a frame and its pose,
         at most, if poses have times. Frames without a pose are left out.
         """
-        self.folder = layout.locate(root, name)
-        self.name, self.speed = self.folder.name, speed
-        files = layout.files(self.folder, camera)
-        own_calibration = files.calibration
+        folder = layout.locate(root, name)
+        files = layout.files(folder, camera)
+        calibration_path, poses_path = files.calibration, files.poses
+        read_camera, read_poses = files.read_camera, files.read_poses
         if calibration is not None:
+            calibration_path = Path(calibration)
             read_camera = partial(cameras.read_camera, name=files.camera)
-            files = files._replace(read_camera=read_camera, calibration=Path(calibration))
         if truth is not None:
-            files = files._replace(read_poses=read_truth, poses=Path(truth))
-        self.frame_paths, self._others = files.frames, files.others
-        self.calibration_path = files.calibration
-        self.times_path, self.poses_path = files.times, files.poses
-        lens = files.read_camera(self.calibration_path)
-        self.lens = lens
-        self.intrinsics, self.distortion, self.stated_size = lens[:3]
-        self._body, self._body_path = lens.body, self.calibration_path
-        if lens.body is None:  # another calibration leaves T_BS as it is
-            self._body, self._body_path = cameras.read_body(own_calibration), own_calibration
-            self._others += (own_calibration,) if self._body is not None else ()
-        # whether somebody said what they are
-        self.has_times = self.times_path.exists() or fps is not None
-        self.times = self._read_times(files.read_times, fps)
-        self.has_truth = truth is not None or (speed is None and self.poses_path.exists())
-        if self.has_truth:
-            times = self.times if self.has_times else None
-            indices, poses = files.read_poses(self.poses_path, times, truth_within)
-            self._take_truth(indices, poses, truth_within)
+            poses_path, read_poses = Path(truth), read_truth
+        lens = read_camera(calibration_path)
+        texts = [calibration_path, files.times, poses_path, *files.others]
+        times, has_times = _read_times(files, fps)
+        has_truth = truth is not None or (speed is None and poses_path.exists())
         if speed is not None:
-            self._check_speed(speed)
+            _check_speed(speed, has_times, has_truth, poses_path)
+        kept, poses = np.arange(len(files.frames)), None
+        if has_truth:
+            indices, poses = read_poses(poses_path, times if has_times else None, truth_within)
+            if poses_path.suffix == ".csv":
+                body_path, body = _camera_in_body(files, calibration_path, lens)
+                poses = _poses_of_camera(poses, poses_path, body, body_path)
+                texts.append(body_path)
+            if indices is None:
+                check_count(poses_path, len(poses), files.frames)
+            else:
+                _tell_missing(poses_path, indices, files.frames, truth_within)
+                kept = indices
 
-    def _read_times(self, read: Callable[[Path], np.ndarray], fps: float | None) -> np.ndarray:
-        path = self.times_path
-        if path.exists():
-            if fps is not None:
-                raise InputError(f"fps {fps:g}: leave it out; {path} has the times of the frames")
-            times = read(path)
-            check_count(path, len(times), self.frame_paths)
-            return times
-        if fps is not None:
-            if not 0 < fps < np.inf:
-                raise InputError(f"fps {fps:g}: must be a number of frames a second, above 0")
-            return np.arange(len(self)) / fps
-        named = times_in_names(self.frame_paths)
-        if named is not None:
-            self.has_times = True
-            say_once(
-                f"{self.folder}: the names of the frames are their times (--fps says otherwise)"
-            )
-            return named
-        say_once(
-            f"{path}: no such file, so {1 / FRAME_TIME:g} frames a second are assumed (--fps gives another "
-            "number)"
-        )
-        return FRAME_TIME * np.arange(len(self))
-
-    def _take_truth(self, indices: np.ndarray | None, poses: np.ndarray, within: float) -> None:
-        """Take poses of the frames with these indices, and leave out the others; None: all frames.
-
-        EuRoC's files (.csv) hold those of a body, others the camera's.
-        """
-        self._poses, path = poses, self.poses_path
-        if path.suffix == ".csv" and self._body is not None:
-            self._poses = poses @ self._body
-            say_once(f"{path}: poses of the body become the camera's by T_BS of {self._body_path}")
-        elif path.suffix == ".csv":
-            say_once(
-                f"{path}: holds poses of a body, which are taken as the camera's, because {self._body_path} "
-                "has no T_BS, the camera's pose in the body",
-                warns=True,
-            )
-        elif self._body is not None:
-            say_once(
-                f"{path}: poses are taken as the camera's; if they are those of the body that {self._body_path} "
-                "knows (T_BS), give EuRoC's .csv"
-            )
-        if indices is None:
-            check_count(path, len(poses), self.frame_paths)
-            return
-        inner = np.setdiff1d(np.arange(indices[0], indices[-1] + 1), indices)
-        line = f"{path}: has poses of {len(indices)} of {len(self)} frames, which are used"
-        if len(inner):
-            line += (
-                f"; {len(inner)} between them, the first one {self.frame_paths[inner[0]].name}, have none "
-                f"within {within:g} s"
-            )
-        if len(indices) < len(self):
-            say_once(line)
-        self.frame_paths = [self.frame_paths[index] for index in indices]
-        self.times = self.times[indices]
-
-    def _check_speed(self, speed: float) -> None:
-        if not 0 < speed < np.inf:
-            raise InputError(f"speed {speed:g}: must be a number of metres a second, above 0")
-        if self.has_truth:
-            raise InputError(
-                f"speed {speed}: leave it out; {self.poses_path} has the true step lengths"
-            )
-        if self.poses_path.exists():
-            say_once(f"{self.poses_path}: true poses are not used, because of the speed")
-        if not self.has_times:
-            raise InputError(
-                f"speed {speed}: needs the times of the frames (times.txt), or their number a second "
-                "(--fps)"
-            )
+        self.folder, self.name, self.speed = folder, folder.name, speed
+        self.frame_paths = [files.frames[index] for index in kept]
+        self.times, self.has_times = times[kept], has_times
+        self.lens, self.intrinsics = lens, lens.matrix
+        self.has_truth, self._poses = has_truth, poses
+        self.calibration_path, self.poses_path = calibration_path, poses_path
+        self._texts = dict.fromkeys(texts)
 
     @property
     def poses(self) -> np.ndarray:
@@ -171,7 +102,7 @@ class Sequence:
 
         Raises InputError if there is none.
         """
-        if not self.has_truth:
+        if self._poses is None:
             raise InputError(f"{self.poses_path}: no such file; ground truth is needed")
         return self._poses
 
@@ -189,10 +120,9 @@ class Sequence:
     def files(self) -> list[Path]:
         """All files of the sequence.
 
-        Frames and calibration, and the files of times and poses if they exist.
+        Frames and calibration, and those of times and poses that exist.
         """
-        texts = self.calibration_path, self.times_path, self.poses_path
-        return [*self.frame_paths, *filter(Path.is_file, texts), *self._others]
+        return [*self.frame_paths, *filter(Path.is_file, self._texts)]
 
     def digest(self) -> str:
         """What tells the sequence from others in a record of results."""
@@ -215,7 +145,7 @@ class Sequence:
         """Size (height, width) of the first frame. Raises InputError as `check_camera` does."""
         first = self.frame_paths[0]
         size = read_gray(first, np.uint16).shape
-        check_camera(self.calibration_path, self.intrinsics, first, size, self.stated_size)
+        check_camera(self.calibration_path, self.intrinsics, first, size, self.lens.size)
         return size
 
     def frame(self, index: int) -> np.ndarray:
@@ -257,7 +187,7 @@ class Sequence:
             pixels = read_unchanged(self.frame_paths[index])
             if pixels.ndim == 3 and pixels.shape[2] == 4:
                 hidden |= self.undistorted((pixels[..., 3] == 0).astype(np.uint8)) > 0
-        if self.distortion.any():
+        if self.lens.distortion.any():
             hidden |= self.undistorted(np.full(self.size, 255, np.uint8)) == 0
         if not hidden.any():
             return None
@@ -275,9 +205,85 @@ class Sequence:
             raise InputError(f"sequence {self.name}: subset({count}); must be 1 frame or more")
         short = copy(self)
         short.frame_paths, short.times = self.frame_paths[:count], self.times[:count]
-        if self.has_truth:
+        if self._poses is not None:
             short._poses = self._poses[:count]
         return short
+
+
+def _read_times(files: Files, fps: float | None) -> tuple[np.ndarray, bool]:
+    """Times of the frames, (n,), seconds, and whether somebody said what they are."""
+    count = len(files.frames)
+    if files.times.exists():
+        if fps is not None:
+            raise InputError(
+                f"fps {fps:g}: leave it out; {files.times} has the times of the frames"
+            )
+        times = files.read_times(files.times)
+        check_count(files.times, len(times), files.frames)
+        return times, True
+    if fps is not None:
+        if not 0 < fps < np.inf:
+            raise InputError(f"fps {fps:g}: must be a number of frames a second, above 0")
+        return np.arange(count) / fps, True
+    say_once(
+        f"{files.times}: no such file, so {1 / FRAME_TIME:g} frames a second are assumed (--fps gives another "
+        "number)"
+    )
+    return FRAME_TIME * np.arange(count), False
+
+
+def _check_speed(speed: float, has_times: bool, has_truth: bool, poses_path: Path) -> None:
+    if not 0 < speed < np.inf:
+        raise InputError(f"speed {speed:g}: must be a number of metres a second, above 0")
+    if has_truth:
+        raise InputError(f"speed {speed}: leave it out; {poses_path} has the true step lengths")
+    if poses_path.exists():
+        say_once(f"{poses_path}: true poses are not used, because of the speed")
+    if not has_times:
+        raise InputError(
+            f"speed {speed}: needs the times of the frames (times.txt), or their number a second (--fps)"
+        )
+
+
+def _camera_in_body(
+    files: Files, calibration_path: Path, lens: cameras.Camera
+) -> tuple[Path, np.ndarray | None]:
+    """File that states the camera's pose in the body (T_BS), and the pose.
+
+    Another calibration without one leaves that of the layout as it is.
+    """
+    if lens.body is None and files.calibration.is_file():
+        return files.calibration, files.read_camera(files.calibration).body
+    return calibration_path, lens.body
+
+
+def _poses_of_camera(
+    poses: np.ndarray, path: Path, body: np.ndarray | None, body_path: Path
+) -> np.ndarray:
+    """Poses of the camera, (n, 4, 4), of those of a body, which EuRoC's files (.csv) hold."""
+    if body is None:
+        say_once(
+            f"{path}: holds poses of a body, which are taken as the camera's, because {body_path} has no "
+            "T_BS, the camera's pose in the body",
+            warns=True,
+        )
+        return poses
+    say_once(f"{path}: poses of the body become the camera's by T_BS of {body_path}")
+    return poses @ body
+
+
+def _tell_missing(path: Path, indices: np.ndarray, frames: list[Path], within: float) -> None:
+    """Say which frames have no pose, and are left out. indices: of those that have one."""
+    if len(indices) == len(frames):
+        return
+    line = f"{path}: has poses of {len(indices)} of {len(frames)} frames, which are used"
+    inner = np.setdiff1d(np.arange(indices[0], indices[-1] + 1), indices)
+    if len(inner):
+        line += (
+            f"; {len(inner)} between them, the first one {frames[inner[0]].name}, have none within "
+            f"{within:g} s"
+        )
+    say_once(line)
 
 
 def check_count(path: Path, count: int, frame_paths: list[Path]) -> None:

@@ -11,23 +11,6 @@ from thesis_repro.running.files import write_text
 
 QUATERNION_TOLERANCE = 0.01  # of their length; files have few digits
 WITHIN = 0.01  # seconds between a frame and its pose, evo's limit; TUM's own tool takes 0.02
-# {data set: Python that writes a file of its poses for `read_poses`}
-CONVERSIONS = {
-    "Virtual KITTI 2": (
-        "t = np.loadtxt('extrinsic.txt', skiprows=1); "
-        "p = np.linalg.inv(t[t[:, 1] == 0, 2:].reshape(-1, 4, 4)); "
-        "np.savetxt('poses.txt', p[:, :3].reshape(-1, 12))"
-    ),
-    "TartanAir": (
-        "t = np.loadtxt('pose_left.txt'); p = np.tile(np.eye(4), (len(t), 1, 1)); "
-        "p[:, :3, 3] = t[:, :3]; p[:, :3, :3] = Rotation.from_quat(t[:, 3:]).as_matrix() @ "
-        "[[0, 0, 1], [1, 0, 0], [0, 1, 0]]; np.savetxt('poses.txt', p[:, :3].reshape(-1, 12))"
-    ),
-    "KITTI-360": (
-        "t = np.loadtxt('cam0_to_world.txt'); np.savetxt('poses.txt', t[:, 1:13]); "
-        "[shutil.copy(f'data_rect/{n:010.0f}.png', 'own') for n in t[:, 0]]"
-    ),
-}
 
 
 def read_text(path: str | Path) -> str:
@@ -95,31 +78,13 @@ def read_times(path: str | Path) -> np.ndarray:
     return times
 
 
-def _check_known(path: str | Path) -> None:
-    """Raise InputError, with what converts it, for a file of another data set's poses."""
-    words = read_text(path).split("\n")[0].split()
-    names = {2: "Virtual KITTI 2", 7: "TartanAir"}
-    name = names.get(2 if words[:2] == ["frame", "cameraID"] else len(words))
-    if name:
-        raise InputError(f"{path}: has the form of {name}; in Python: {CONVERSIONS[name]}")
-
-
 def read_poses(path: str | Path) -> np.ndarray:
     """Camera-to-world poses, (n, 4, 4), metres, from 12 or 16 numbers a line.
 
-    These are the first three or all four rows of each pose. The number of the frame may stand
-    before them. Raises InputError if a line is not a right-handed rotation and a position, or if
-    the numbers of the frames do not count by one.
+    These are the first three or all four rows of each pose. Raises InputError if a line is not a
+    right-handed rotation and a position.
     """
-    _check_known(path)
-    rows, line_numbers = _read_numbers(path, 12, 13, 16, 17)
-    if rows.shape[1] in (13, 17):
-        if (np.diff(rows[:, 0]) != 1).any():
-            raise InputError(
-                f"{path}: the first numbers do not count the frames one by one; KITTI-360 has poses of some "
-                f"frames, so in Python: {CONVERSIONS['KITTI-360']}"
-            )
-        rows = rows[:, 1:]
+    rows, line_numbers = _read_numbers(path, 12, 16)
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     poses.reshape(-1, 16)[:, : rows.shape[1]] = rows
     bad_rows = np.flatnonzero(~are_poses(poses))

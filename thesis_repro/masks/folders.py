@@ -153,21 +153,18 @@ def read_mask(
 ) -> np.ndarray:
     """Read a mask, (height, width) uint8: 0 where keypoints are forbidden, 255 elsewhere.
 
-    Masks of other tools are read, too: the alpha channel of an image of one colour; any other value
-    in place of 255; of gray edges, the nearer of 0 and 255. size: (height, width) of its frame.
+    Masks of other tools are read, too: any other value in place of 255; of gray edges, the nearer
+    of 0 and 255. size: (height, width) of its frame.
     invert: 0 allows keypoints, and any other value forbids them, such as the id or colour of an
     object; of a JPEG file, whose values are not exact, those nearer to 255.
-    Raises InputError for another size, for a picture with an alpha channel, and if it is not plain
-    which values are meant: areas of gray, as of a label map or of several objects.
+    Raises InputError for another size, for an alpha channel, and if it is not plain which values
+    are meant: areas of gray, as of a label map or of several objects.
     """
-    mask = pixels = read_unchanged(path)
-    if pixels.ndim == 3:
-        mask = pixels[..., :3].max(axis=2)
-        alpha = pixels[..., 3:]
-        if (alpha != alpha[:1, :1]).any():
-            if (mask != mask[0, 0]).any():
-                raise InputError(f"{path}: holds a picture and an alpha channel; save one of them")
-            mask = alpha[..., 0]
+    mask = read_unchanged(path)
+    if mask.ndim == 3:
+        if (mask[..., 3:] < np.iinfo(mask.dtype).max).any():
+            raise InputError(f"{path}: has an alpha channel; save the mask in gray")
+        mask = mask[..., :3].max(axis=2)
     if size is not None:
         check_size(Path(path), mask.shape, size, "its frame")
     if invert and Path(path).suffix.lower() == ".png":
@@ -210,14 +207,13 @@ def _mask_paths(folder: str | Path, sequence: Sequence) -> list[Path]:
     if Path(folder).is_file():
         _check_lens(Path(folder), sequence, "mask")
         return [Path(folder)] * len(sequence)
-    _check_format(Path(folder))
     place = _existing_folder(folder, sequence, "mask")
     present = _images_by_name(place)
     if len(present) == 1:
         single = next(iter(present.values()))
         # a single mask with the name of a frame, also outside of a subset, is that frame's
         frames = listed(sequence.frame_paths[0].parent, "*")
-        if single.stem not in {name for path in frames for name in (path.stem, path.name)}:
+        if single.stem not in [path.stem for path in frames]:
             return [single] * len(sequence)
     return _by_frame(place, present, sequence, "mask")
 
@@ -232,7 +228,7 @@ def _existing_folder(folder: str | Path, sequence: Sequence, kind: str) -> Path:
     place = folder_of_sequence(folder, sequence.name)
     if not place.is_dir():
         raise InputError(
-            f"{place}: no such folder; it must hold one {kind} for each frame of sequence "
+            f"{place}: no such folder; it must hold one {kind}, an image, for each frame of sequence "
             f"{sequence.name}"
         )
     _check_lens(place, sequence, kind)
@@ -258,9 +254,6 @@ def _check_lens(place: Path, sequence: Sequence, kind: str) -> None:
 
 def _by_frame(folder: Path, present: dict[str, Path], sequence: Sequence, kind: str) -> list[Path]:
     """One path a frame, of those that are present, by name. Raises InputError if one is missing."""
-    # some tools append .png to the whole name
-    appended = {f"{frame.name}.png": f"{frame.stem}.png" for frame in sequence.frame_paths}
-    present = {appended.get(name, name): path for name, path in present.items()}
     missing = [name for name in sequence.label_names if name not in present]
     if missing:
         raise InputError(
@@ -268,16 +261,6 @@ def _by_frame(folder: Path, present: dict[str, Path], sequence: Sequence, kind: 
             f"{sequence.name} have none); each frame needs one"
         )
     return [present[name] for name in sequence.label_names]
-
-
-def _check_format(folder: Path) -> None:
-    """Raise InputError for a folder with files, none of which is an image."""
-    endings = {path.suffix for path in listed(folder, "*") if path.is_file()}
-    if endings and not _images_by_name(folder):
-        raise InputError(
-            f"{folder}: holds {', '.join(sorted(endings))}; masks are PNG or JPEG images, one for "
-            "each frame"
-        )
 
 
 def _images_by_name(folder: Path) -> dict[str, Path]:
