@@ -94,17 +94,17 @@ def word(of_streets: pd.DataFrame, ends: tuple[str, str] = ("low", "high")) -> s
 
 
 def hangs_on(of_streets: pd.DataFrame) -> str:
-    """Return without what the verdict on both errors is another one: "two streets (1 of 55)".
+    """Return without what the verdict on both errors is another one: "two sequences (1 of 55)".
 
     of_streets: of `over`. "nothing" if it stays everywhere.
     """
     told, found = word(of_streets), []
     streets = list(of_streets.index)
     cases: dict[str, list[Collection[str]]] = {
-        "one street": [[street] for street in streets],
-        "two streets": [*combinations(streets, 2)],
+        "one sequence": [[street] for street in streets],
+        "two sequences": [*combinations(streets, 2)],
         "a day": [*DAYS.values()],
-        "the new streets": [NEW],
+        "the new sequences": [NEW],
         ", ".join(HARD): [HARD],
     }
     for name, left_out in cases.items():

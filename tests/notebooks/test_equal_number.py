@@ -26,16 +26,16 @@ def test_a_verdict_that_hangs_on_streets_says_so():
     """Two streets of one day hold against all others, so one pair and one day decide."""
     of_streets = table({"05": 0.5, "06": 0.55})
     assert equal_number.word(of_streets) == verdicts.NO_CLEAR_DIFFERENCE
-    assert equal_number.hangs_on(of_streets) == "two streets (1 of 55); a day (1 of 3)"
+    assert equal_number.hangs_on(of_streets) == "two sequences (1 of 55); a day (1 of 3)"
     new = table(dict.fromkeys(equal_number.NEW, 0.5))
-    assert "the new streets" in equal_number.hangs_on(new)
+    assert "the new sequences" in equal_number.hangs_on(new)
     one_far_off = table({street: 1.01 for street in STREETS} | {"01": 99.0})
     assert equal_number.hangs_on(one_far_off) == "the signed rank"
 
 
 def test_fewer_than_six_streets_tell_nothing():
     assert equal_number.word(table({}).iloc[:5]) == verdicts.TOO_FEW
-    assert equal_number.hangs_on(table({}).iloc[:6]).startswith("one street (6 of 6); ")
+    assert equal_number.hangs_on(table({}).iloc[:6]).startswith("one sequence (6 of 6); ")
 
 
 def test_half_of_the_runs_make_a_street_fail():
