@@ -121,7 +121,7 @@ evidence: setup
 	@THESIS_REPRO_PROFILE=thesis $(BIN)/python tools/evidence.py
 	@$(BIN)/python tools/write_texts.py
 timings: setup
-	@$(if $(KITTI),THESIS_REPRO_PROFILE=thesis) $(BIN)/python tools/timings.py
+	@$(if $(KITTI),THESIS_REPRO_PROFILE=$(or $(THESIS_REPRO_PROFILE),thesis)) $(BIN)/python tools/timings.py
 clean:
 	rm -rf .venv build *.egg-info .pytest_cache .ruff_cache .mypy_cache
 	find figures -mindepth 1 -maxdepth 1 -type d -not -name kitti_excerpts -not -name camvid -not -name timings -exec rm -rf {} +
