@@ -1,16 +1,18 @@
 """The recorder of PySLAM's runs, with stand-ins for PySLAM's modules that call OpenCV alike."""
 
 import sys
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from trials import ROOT, succeed
+from trials import succeed
 
 from thesis_repro import odometry
 from thesis_repro.data.sequence import Sequence
 from thesis_repro.masks.folders import LabelMasks, MaskFolder
 from thesis_repro.running.files import write_png
 
+RECORDER = Path(__file__).with_name("record_pyslam.py")
 COUNTS = {"points": "n_kps_to_lk", "detected": "n_detected", "tracked": "n_tracked"}
 COUNTS |= {"inliers": "n_inliers_E", "pose_inliers": "n_inliers_recoverPose"}
 STAND_INS = {
@@ -97,8 +99,8 @@ def test_it_writes_poses_and_counts_with_and_without_masks(small_world, small_la
     runs = {"all": [], "masked": [folder]}
     for name, masks in runs.items():
         output = tmp_path / f"{name}.csv"
-        command = [sys.executable, ROOT / "tools/record_pyslam.py", "pyslam", small_world / "kitti"]
-        succeed([*command, "00", output, *masks], tmp_path)
+        command = [sys.executable, RECORDER, "pyslam", small_world / "kitti", "00", output]
+        succeed([*command, *masks], tmp_path)
         recorded = pd.read_csv(output)
         given = {"masks": MaskFolder(folder, drive)} if masks else {}
         ours = odometry.run(drive, **given).frames

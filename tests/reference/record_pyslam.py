@@ -1,6 +1,6 @@
 """Record a run of PySLAM itself, to compare the odometry with: a table with one row a frame.
 
-Usage, where PySLAM runs: python tools/record_pyslam.py PYSLAM KITTI SEQUENCE OUTPUT.csv [MASKS]
+Usage, where PySLAM runs: python record_pyslam.py PYSLAM KITTI SEQUENCE OUTPUT.csv [MASKS]
 
 PYSLAM: its checkout, at commit a87ee17 (7 August 2021), the last before 2023 that changes its
 visual odometry. KITTI: a folder in the layout of KITTI's odometry benchmark. MASKS: a folder with

@@ -1,7 +1,7 @@
-"""Record real steps in numbers: python tools/reference_steps.py KITTI MASKS.
+"""Record real steps in numbers: python tests/reference/reference_steps.py KITTI MASKS.
 
-Writes tests/reference, from which every clone checks both estimators on real data. Its README says
-what the files hold, and how the masks are made. KITTI: folder of sequences. MASKS: a folder of
+Writes the files of this folder, from which every clone checks both estimators on real data. README
+says what they hold, and how the masks are made. KITTI: folder of sequences. MASKS: a folder of
 masks for each of 00, 01 and 07.
 """
 
@@ -20,7 +20,7 @@ from thesis_repro.odometry import THESIS, Odometry, run_many
 from thesis_repro.odometry.estimators import refined
 from thesis_repro.odometry.loop import normalise
 
-FOLDER = Path(__file__).parent.parent / "tests" / "reference"
+FOLDER = Path(__file__).parent
 SETTINGS = {"thesis": THESIS, "refined": replace(THESIS, estimator=refined)}
 # {run: (its sequence, its first and its last recorded step, its keypoints in place of 2000)};
 # step n ends in frame n
