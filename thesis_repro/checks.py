@@ -9,7 +9,6 @@ from collections.abc import Callable, Collection, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from functools import partial
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -36,16 +35,17 @@ MAX_DROPPED = 0.1  # share of a run's steps
 def _damaged(read: Callable, items: Collection, description: str) -> list[str]:
     """Read every item in threads, because decoding releases Python's lock; return the problems."""
 
-    def problem(item: Any) -> list[str]:
+    def problem(item: Any) -> str:
         try:
             read(item)
         except InputError as error:
-            return [str(error)]
-        return []
+            return str(error)
+        return ""
 
     with ThreadPoolExecutor() as threads:
         done = threads.map(problem, items)
-        return list(chain(*files.progress(done, description, total=len(items), unit="file")))
+        told = files.progress(done, description, total=len(items), unit="file")
+        return list(filter(None, told))
 
 
 def check_kitti(root: Path) -> list[str]:
@@ -93,8 +93,8 @@ def check_cityscapes(root: Path, splits: Iterable[str] = ("train", "val")) -> li
         sampled = [pairs[index].label for index in _sample(len(pairs))]
         with suppress(InputError):  # of a damaged one, which is told below
             shares = _class_shares([cityscapes.read_label_map(path) for path in sampled])
-            told = _label_map_doubts(shares, LABEL_IDS)
-            print("".join(f"  split {split}: {text}\n" for text in told[:1]), end="")
+            for text in _label_map_doubts(shares, LABEL_IDS):
+                print(f"  split {split}: {text}")
         problems += _damaged(read_pair, pairs, f"split {split}")
     return sorted(problems)
 
