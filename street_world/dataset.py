@@ -17,7 +17,7 @@ from joblib import cpu_count as cores
 
 from street_world import drives, street, textures
 from thesis_repro.data import kitti, trajectories
-from thesis_repro.data.memory import FRAME_TIME
+from thesis_repro.data.arrays import FRAME_TIME
 from thesis_repro.running import provenance
 from thesis_repro.running.files import progress, write_png, write_text
 from thesis_repro.running.workers import open_pool

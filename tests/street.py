@@ -6,7 +6,7 @@ It is rendered with exact arithmetic, the same on every machine.
 import cv2
 import numpy as np
 
-from thesis_repro.data.memory import distances
+from thesis_repro.data.arrays import distances
 
 
 class Street:

@@ -4,7 +4,7 @@
 
 from typing import Any
 
-from thesis_repro.data.memory import SequenceLike
+from thesis_repro.data.arrays import SequenceLike
 from thesis_repro.data.sequence import Sequence
 from thesis_repro.errors import missing_package
 from thesis_repro.masks import MaskSettings, keypoint_mask

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from thesis_repro.data import cityscapes, kitti
+from thesis_repro.data.arrays import are_impossible
 from thesis_repro.data.label_ids import LABEL_IDS
-from thesis_repro.data.memory import are_impossible
 from thesis_repro.data.sequence import Sequence, check_size
 from thesis_repro.errors import InputError, one_line
 from thesis_repro.masks import coverage

@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 
 from thesis_repro.data import cameras, layout
+from thesis_repro.data.arrays import FRAME_TIME, ArraySequence, distances, step_lengths
 from thesis_repro.data.frames import Files, eight_bits, say_once, white_level
 from thesis_repro.data.geometry import check_camera
-from thesis_repro.data.memory import FRAME_TIME, ArraySequence, distances, step_lengths
 from thesis_repro.data.trajectories import WITHIN, read_truth
 from thesis_repro.errors import InputError
 from thesis_repro.running import provenance

@@ -10,7 +10,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 import pandas as pd
 
-from thesis_repro.data.memory import SequenceLike
+from thesis_repro.data.arrays import SequenceLike
 from thesis_repro.data.trajectories import write_kitti_poses, write_tum
 from thesis_repro.errors import InputError
 from thesis_repro.odometry.inputs import EQUAL, unchangeable
