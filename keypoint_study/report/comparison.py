@@ -178,8 +178,8 @@ def table_of_ratios(rows: pd.DataFrame) -> pd.DataFrame:
     """Return rows of `comparisons_of` for readers: one row for each pair of methods and estimator.
 
     A ratio is a text, "1.09 (0.98-1.32)", see `texts.short`. The verdict is that of all judging
-    metrics. "failures" is the verdict on the failed runs. With too few
-    sequences to tell, neither is there.
+    metrics. "failures" is the verdict on the failed runs. With too few sequences to tell, neither
+    is there.
     """
     rows = rows[(rows["method"] != "baseline") & rows["metric"].isin(SHOWN)]
     keys = ["estimator", "source", "method", "dilation_width", "reference_source", "reference"]
@@ -189,29 +189,24 @@ def table_of_ratios(rows: pd.DataFrame) -> pd.DataFrame:
         over = comparisons.METHOD_TITLES[first["reference"]]
         if first["reference_source"] not in ("", first["source"]):
             over = f"{first['reference_source']}: {over}"
+        line = {
+            "estimator": ESTIMATOR_TITLES[first["estimator"]],
+            "keypoints": first["label"],
+            "number": round(first["keypoints"]),
+            "over": over,
+            "sequences": pair["n"].max(),
+        }
+        for _, row in pair.iterrows():
+            line[comparisons.METRIC_TITLES[row["metric"]]] = texts.short(row)
         judging = pair[pair["metric"].isin(comparisons.JUDGING_METRICS)]
-        lines.append(
-            {
-                "estimator": ESTIMATOR_TITLES[first["estimator"]],
-                "keypoints": first["label"],
-                "number": first["keypoints"],
-                "over": over,
-                "sequences": pair["n"].max(),
-                **{
-                    comparisons.METRIC_TITLES[row["metric"]]: texts.short(row)
-                    for _, row in pair.iterrows()
-                },
-                "verdict": comparisons.verdict_of(judging),
-                FAIL: first["failed"],
-                f"{FAIL}, of the reference": first["reference_failed"],
-                "failures": first["failures_verdict"],
-            }
-        )
-    table = pd.DataFrame(lines)
-    if lines:
-        table["number"] = table["number"].round().astype(int)
-        table = texts.without_untold(table, "verdict", "failures")
-    return table
+        line |= {
+            "verdict": comparisons.verdict_of(judging),
+            FAIL: first["failed"],
+            f"{FAIL}, of the reference": first["reference_failed"],
+            "failures": first["failures_verdict"],
+        }
+        lines.append(line)
+    return texts.without_untold(pd.DataFrame(lines), "verdict", "failures")
 
 
 def long_table_of_ratios(table: pd.DataFrame) -> Artefact:
@@ -245,10 +240,8 @@ def table_of_errors(table: pd.DataFrame, runs: pd.DataFrame) -> Artefact:
         means = errors.mean().unstack().reindex(labels)
         cells = errors.agg(_mean_and_spread).unstack().reindex(labels)
         cells = cells.mask(means == means.min(), "**" + cells + "**")
-        error = ERRORS[metric]
-        parts[f"{error.title} ({error.unit})", ESTIMATOR_TITLES[estimator]] = cells.dropna(
-            how="all"
-        )
+        error = f"{ERRORS[metric].title} ({ERRORS[metric].unit})"
+        parts[error, ESTIMATOR_TITLES[estimator]] = cells.dropna(how="all")
     shown = pd.concat(parts, names=["error", "estimator", "method"]).reset_index()
     return Artefact("errors", *CAPTIONS["errors"], shown)
 
@@ -287,24 +280,19 @@ def _widths(masked: pd.DataFrame, baseline: pd.DataFrame) -> pd.DataFrame:
     """Return `table_of_widths` of one source."""
     chosen = best_width.chosen_widths(masked, baseline)
     stability = best_width.stability(masked, baseline)
-    metrics = [name for name in ("rmse", "se3") if name in masked]
     columns, failed = {}, {}
     for choice, label in CHOICES.items():
         rows = best_width.of_chosen_width(masked, chosen[choice])
-        for metric in metrics:
-            by_sequence = ratios.ratios_of(rows, baseline, metric)
+        for metric in ("rmse", "se3"):
             name = f"{label}: {comparisons.METRIC_TITLES[metric]}"
-            columns[name] = by_sequence
+            columns[name] = ratios.ratios_of(rows, baseline, metric)
             failed[name] = ratios.count_failing(ratios.has_failed(rows.set_index("sequence")))
     columns["best width of one repetition, in the others: RMSE"] = stability["elsewhere"]
     table = pd.DataFrame(columns, index=chosen.index).dropna(axis=1, how="all")
     shown = table.map(texts.number, na_action="ignore").astype(object)
-    means, lower = {}, {}
     for name, of_choice in table.items():
-        means[name] = texts.short(ratios.typical_ratio(of_choice))
-        lower[name] = f"{(of_choice < 1).sum()} of {of_choice.count()}"
-    shown.loc["all sequences"] = means
-    shown.loc["lower in"] = lower
+        shown.loc["all sequences", name] = texts.short(ratios.typical_ratio(of_choice))
+        shown.loc["lower in", name] = f"{(of_choice < 1).sum()} of {of_choice.count()}"
     shown.loc[FAIL] = failed
     widths = chosen[list(CHOICES)].rename(columns=CHOICES)
     widths["same best width in two repetitions (%)"] = stability["same_best"].round()

@@ -26,38 +26,43 @@ def figure_of_paths(
     paths: {name: (n, 4, 4) poses, aligned}. true: (n, 4, 4), or None. width: inches; in one column
     the panels are below each other.
     """
-    columns = 1 if true is None or width <= COLUMN_WIDTH else 2
-    rows = 1 if true is None else 3 - columns
+    rows, columns = (1, 2) if width > COLUMN_WIDTH else (2, 1)
+    if true is None:
+        rows, columns = 1, 1
     drawing, panels = new_figure(rows, columns, 3.4 * rows, width, squeeze=False)
     above = panels.flat[0]
     places = {name: poses[:, [0, 2], 3] for name, poses in paths.items()}
-    kept = places
+    kept = list(paths)
     if true is not None:
-        distances = {
-            name: np.linalg.norm(poses[:, :3, 3] - true[:, :3, 3], axis=1)
-            for name, poses in paths.items()
-        }
+        distances = {}
+        for name, poses in paths.items():
+            distances[name] = np.linalg.norm(poses[:, :3, 3] - true[:, :3, 3], axis=1)
         limit = STRAYED * np.ptp(true[:, :3, 3], axis=0).max()
         # nothing is cut if all have strayed
-        kept = {name: each for name, each in places.items() if distances[name].max() <= limit}
-        kept = kept or places
+        kept = [name for name in paths if distances[name].max() <= limit] or kept
         _draw_distances(panels.flat[1], distances, metrics.travelled(true), kept)
         above.plot(*true[:, [0, 2], 3].T, label="ground truth", **OF_TRUTH)
     for index, (name, each) in enumerate(places.items()):
         label = one_line(name) + " (leaves the picture)" * (name not in kept)
         above.plot(*each.T, label=label, **line_style(index))
-    if true is not None and len(kept) < len(places):
-        shown = np.concatenate([true[:, [0, 2], 3], *kept.values()])
-        middle = (shown.min(0) + shown.max(0)) / 2
-        half = (0.5 + MARGIN) * np.ptp(shown, axis=0).max()
-        (left, bottom), (right, top) = middle - half, middle + half
-        above.set(xlim=(left, right), ylim=(bottom, top))
     above.set(xlabel="x (m)", ylabel="z (m)", title=f"{one_line(title)} from above")
-    above.set_aspect("equal", adjustable="box" if len(kept) < len(places) else "datalim")
+    above.set_aspect("equal", adjustable="datalim")
+    if true is not None and len(kept) < len(places):
+        _cut(above, [true[:, [0, 2], 3], *(places[name] for name in kept)])
     handles = above.get_legend_handles_labels()
     names = 3 if width > COLUMN_WIDTH else 1
     drawing.legend(*handles, loc="outside lower center", ncols=names)
     return drawing
+
+
+def _cut(panel: Axes, shown: list[np.ndarray]) -> None:
+    """Limit a panel to a square around paths. shown: (n, 2) each."""
+    points = np.concatenate(shown)
+    middle = (points.min(0) + points.max(0)) / 2
+    half = (0.5 + MARGIN) * np.ptp(points, axis=0).max()
+    (left, bottom), (right, top) = middle - half, middle + half
+    panel.set(xlim=(left, right), ylim=(bottom, top))
+    panel.set_aspect("equal", adjustable="box")
 
 
 def _draw_distances(

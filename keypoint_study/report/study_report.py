@@ -3,7 +3,7 @@
 Figures are also written as PDF, across a page and in one column of a paper.
 """
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -37,12 +37,7 @@ from thesis_repro.running.files import write_text
 PATHS = "paths"  # folder of the estimated paths
 
 
-def make(
-    study: Study,
-    folder: Path,
-    processes: int = 1,
-    scheduler: str | None = None,
-) -> int:
+def make(study: Study, folder: Path, processes: int = 1, scheduler: str | None = None) -> int:
     """Run a study, and write its page and tables; what is in the folder is kept.
 
     Says what it finds doubtful, and where the page is. Returns 1 if a run failed, otherwise 0.
@@ -71,12 +66,7 @@ def _doubts(study: Study, runs: pd.DataFrame) -> Iterator[str]:
 
 
 @style.applied()
-def write(
-    study: Study,
-    runs: pd.DataFrame,
-    folder: Path,
-    warnings: Collection[str] = (),
-) -> Path:
+def write(study: Study, runs: pd.DataFrame, folder: Path, warnings: Collection[str] = ()) -> Path:
     """Write the findings, figures, tables and page of a `Study` into a folder.
 
     Returns the page's path. warnings: lines for the top of the page.
@@ -92,21 +82,21 @@ def write(
     write_paths(study, runs, folder)
     named = runs.assign(sequence=runs["sequence"].map(one_line))  # for texts and tables
     table = comparisons.comparisons_of(named)
-    findings = Artefact(
-        "findings", "What the runs show", "", findings_of(named, table, note, embedded)
-    )
-    saved = [(findings, style.save(findings, folder, note))]
-    for figure in figures_of(study, runs, table, folder, COLUMN_WIDTH):
-        # a tight box would make it wider or narrower than the column
-        style.write_figure(figure.content, folder / f"{figure.name}-column.pdf", bbox_inches=None)
-        plt.close(figure.content)
+    text_of_findings = findings_of(named, table, note, embedded)
+    findings = Artefact("findings", "What the runs show", "", text_of_findings)
+    shown = [html.described(findings, style.save(findings, folder, note))]
+    save_for_column(figures_of(study, runs, table, folder, COLUMN_WIDTH), folder)
     for figure in figures_of(study, runs, table, folder, PAGE_WIDTH):
         style.write_figure(figure.content, folder / f"{figure.name}.pdf")
         files = style.save(figure, folder, note)
-        saved.append((figure, [*files, f"{figure.name}.pdf", f"{figure.name}-column.pdf"]))
-    saved += [(each, style.save(each, folder, note)) for each in tables_of(named, table)]
+        files += [f"{figure.name}.pdf", f"{figure.name}-column.pdf"]
+        shown.append(html.described(figure, files))
+    for artefact in tables_of(named, table):
+        files = style.save(artefact, folder, note)
+        if files:  # of a table with rows
+            shown.append(html.described(artefact, files))
     text = html.page_of(
-        [html.described(artefact, files) for artefact, files in saved if files],
+        shown,
         study=study,
         failed=[source.name for source in study.sources if source.name not in set(runs["source"])],
         warnings=warnings,
@@ -121,20 +111,26 @@ def write(
     return folder / html.PAGE
 
 
+def save_for_column(figures: Iterable[Artefact], folder: Path) -> None:
+    """Write figures as PDF for one column of a paper."""
+    for figure in figures:
+        # a tight box would make it wider or narrower than the column
+        style.write_figure(figure.content, folder / f"{figure.name}-column.pdf", bbox_inches=None)
+        plt.close(figure.content)
+
+
 def figures_of(
-    study: Study,
-    runs: pd.DataFrame,
-    table: pd.DataFrame,
-    folder: Path,
-    width: float,
+    study: Study, runs: pd.DataFrame, table: pd.DataFrame, folder: Path, width: float
 ) -> Iterator[Artefact]:
     """Draw the figures of a study, of a width in inches.
 
     table: `comparisons_of` the runs.
     """
-    controlled = table[table["method"].isin(comparisons.SEGMENTATION_FREE_CONTROLS)]
-    masked = table.loc[table["method"] == "masked", "source"].unique()
-    for source in ["", *(controlled["source"].unique() if len(masked) > 1 else [])]:
+    sources = [""]
+    if table.loc[table["method"] == "masked", "source"].nunique() > 1:
+        is_control = table["method"].isin(comparisons.SEGMENTATION_FREE_CONTROLS)
+        sources += list(table.loc[is_control, "source"].unique())
+    for source in sources:
         if not comparison.judged(table, source).empty:
             yield comparison.figure_of_ratios(table, source, width)
     if runs["method"].isin(BROUGHT).any():
@@ -193,39 +189,18 @@ def figure_of_sources(study: Study, runs: pd.DataFrame, width: float = PAGE_WIDT
     sources = [source for source in study.sources if source.name in with_runs]
     (sequence,) = (sequence for sequence in study.opened if sequence.name == name)
     index = len(sequence) // 2
-    frame = sequence.frame(index)
+    figure, panels = _panels_of_sources(sequence.frame(index), len(sources), width)
     label_maps = []
-    is_wide = width > COLUMN_WIDTH
-    if is_wide:
-        figure, axes = style.frame_panels(frame, len(sources), 3, 1.5 * width)
-        panels = np.reshape(axes, (-1, 3))
-    else:  # up to three sources side by side, so that it takes half a page
-        columns = min(3, len(sources))
-        figure, axes = style.frame_panels(frame, 3 * -(-len(sources) // columns), columns, width)
-        panels = np.reshape(axes, (-1, 3, columns)).swapaxes(1, 2).reshape(-1, 3)
-    for unused in panels[len(sources) :].flat:
-        unused.set_axis_off()
-    for (first, second, third), source in zip(panels, sources):
-        of_first = f"{source.name}: " if is_wide else f"{source.name}\n"
-        of_others = of_first if is_wide else ""
-        style.show_image(first, frame, f"{of_first}frame {index}")
-        if source.kind == "keypoints":
-            second.set_axis_off()
-            points = own_calls(source.folder).detect(frame, THESIS, sequence.visible(index))
+    for of_source, source in zip(panels, sources):
+        label_maps += _draw_source(of_source, source, sequence, index, study.shown_width)
+        if width > COLUMN_WIDTH:
+            for panel in of_source:
+                if panel.get_title():
+                    panel.set_title(f"{source.name}: {panel.get_title()}")
         else:
-            masks = source.masks(sequence, study.shown_width)
-            if isinstance(masks, LabelMasks):
-                label_maps.append(masks.label_map(index))
-                colors = style.label_colors(label_maps[-1], frame)
-                style.show_image(first, colors, f"{of_first}label map")
-            mask = masks[index]
-            style.show_image(second, mask, f"{of_others}mask", vmin=0, vmax=255)
-            style.outline(second, mask)
-            points = detect(frame, mask=inside(sequence.visible(index), mask))
-        style.show_image(third, frame, f"{of_others}{len(points)} keypoints")
-        third.scatter(*points.T, **style.KEYPOINT)
-    for panel in () if is_wide else panels.flat:
-        panel.title.set_fontsize(6)
+            of_source[0].set_title(f"{source.name}\n{of_source[0].get_title()}")
+            for panel in of_source:
+                panel.title.set_fontsize(6)
     if label_maps:
         style.class_legend(figure, *label_maps)
     return Artefact(
@@ -238,6 +213,47 @@ def figure_of_sources(study: Study, runs: pd.DataFrame, width: float = PAGE_WIDT
         "should discard them, the masks are inverted, and --invert turns them round.",
         figure,
     )
+
+
+def _panels_of_sources(
+    frame: np.ndarray, count: int, width: float
+) -> tuple[plt.Figure, np.ndarray]:
+    """Return a figure and three of its panels for each source, (count, 3)."""
+    if width > COLUMN_WIDTH:
+        figure, axes = style.frame_panels(frame, count, 3, 1.5 * width)
+        return figure, np.reshape(axes, (count, 3))
+    # up to three sources side by side, so that it takes half a page
+    columns = min(3, count)
+    figure, axes = style.frame_panels(frame, 3 * -(-count // columns), columns, width)
+    panels = np.reshape(axes, (-1, 3, columns)).swapaxes(1, 2).reshape(-1, 3)
+    for unused in panels[count:].flat:
+        unused.set_axis_off()
+    return figure, panels[:count]
+
+
+def _draw_source(
+    panels: np.ndarray, source: Source, sequence: Sequence, index: int, width: int | None
+) -> list[np.ndarray]:
+    """Draw what a source has for one frame on three panels; return its label maps: one or none."""
+    first, second, third = panels
+    frame, visible = sequence.frame(index), sequence.visible(index)
+    label_maps: list[np.ndarray] = []
+    style.show_image(first, frame, f"frame {index}")
+    if source.kind == "keypoints":
+        second.set_axis_off()
+        points = own_calls(source.folder).detect(frame, THESIS, visible)
+    else:
+        masks = source.masks(sequence, width)
+        if isinstance(masks, LabelMasks):
+            label_maps.append(masks.label_map(index))
+            style.show_image(first, style.label_colors(label_maps[0], frame), "label map")
+        mask = masks[index]
+        style.show_image(second, mask, "mask", vmin=0, vmax=255)
+        style.outline(second, mask)
+        points = detect(frame, mask=inside(visible, mask))
+    style.show_image(third, frame, f"{len(points)} keypoints")
+    third.scatter(*points.T, **style.KEYPOINT)
+    return label_maps
 
 
 def figure_of_sequence(

@@ -239,6 +239,22 @@ def save_figure(figure: plt.Figure, folder: Path, name: str, note: str) -> str:
 
     The data note is at the foot of the figure, no wider than it, and in the file's metadata.
     """
+    _write_at_foot(figure, note)
+    if any(axes.images for axes in figure.axes):
+        ending, other, note_in_file = ".webp", ".svg", Image.Exif()
+        note_in_file[ExifTags.Base.ImageDescription] = note
+        options: dict[str, Any] = {"pil_kwargs": {"quality": 75, "exif": note_in_file}}
+    else:
+        ending, other = ".svg", ".webp"
+        options = {"metadata": {"Creator": None, "Description": note}}
+    write_figure(figure, folder / f"{name}{ending}", **options)
+    # an earlier run may have written the other format
+    (folder / f"{name}{other}").unlink(missing_ok=True)
+    return f"{name}{ending}"
+
+
+def _write_at_foot(figure: plt.Figure, note: str) -> None:
+    """Write a note below a figure, no wider than it."""
     # a tight box would move legends at the figure's edge onto the note, so their places are fixed
     figure.draw_without_rendering()
     figure.set_layout_engine("none")
@@ -257,17 +273,6 @@ def save_figure(figure: plt.Figure, folder: Path, name: str, note: str) -> str:
         ha="center",
         va="top",
     )
-    if any(axes.images for axes in figure.axes):
-        ending, other, note_in_file = ".webp", ".svg", Image.Exif()
-        note_in_file[ExifTags.Base.ImageDescription] = note
-        options: dict[str, Any] = {"pil_kwargs": {"quality": 75, "exif": note_in_file}}
-    else:
-        ending, other = ".svg", ".webp"
-        options = {"metadata": {"Creator": None, "Description": note}}
-    write_figure(figure, folder / f"{name}{ending}", **options)
-    # an earlier run may have written the other format
-    (folder / f"{name}{other}").unlink(missing_ok=True)
-    return f"{name}{ending}"
 
 
 def write_figure(figure: plt.Figure, path: str | Path, **options: Any) -> None:

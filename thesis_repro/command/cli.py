@@ -153,17 +153,18 @@ def study(options: Any) -> int:
         all_widths = WIDTHS if mask_settings.has_width else ()
         widths = widths.union(*options.widths or [all_widths])
     names = dict.fromkeys(layout.locate(options.kitti, name).name for name in options.sequences)
+    detector = _detector(options)
     planned = Study(
-        options.kitti.absolute(),
-        tuple(names or kitti.sequences(options.kitti)),
-        sources.named(options.sources, mask_settings, options.invert, options.ids),
-        tuple(sorted(widths)),
-        options.controls,
-        tuple(dict.fromkeys(options.estimator)),
-        options.repetitions,
-        options.frames,
-        options.scale_gate,
-        {"detector": detector} if (detector := _detector(options)) else {},
+        kitti=options.kitti.absolute(),
+        sequences=tuple(names or kitti.sequences(options.kitti)),
+        sources=sources.named(options.sources, mask_settings, options.invert, options.ids),
+        widths=tuple(sorted(widths)),
+        tested=options.controls,
+        estimators=tuple(dict.fromkeys(options.estimator)),
+        repetitions=options.repetitions,
+        frames=options.frames,
+        scale_gate=options.scale_gate,
+        masked_settings={"detector": detector} if detector else {},
     )
     planned.check()
     folder = options.folder.absolute()
