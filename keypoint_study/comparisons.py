@@ -92,33 +92,36 @@ def comparisons_of(runs: pd.DataFrame) -> pd.DataFrame:
         for (variant, errors), (reference, reference_errors) in product(variants, variants):
             if not _is_compared(variant, reference):
                 continue
-            of_failures = failures(errors["failed"], reference_errors["failed"])
+            of_pair = {
+                **variant,
+                "reference_source": reference["source"],
+                "reference": reference["method"],
+                "estimator": estimator,
+                **failures(errors["failed"], reference_errors["failed"]),
+            }
+            may_decide = variant["tested"] and estimator == judging
             for metric in metrics:
                 by_sequence = np.exp((errors[metric] - reference_errors[metric]).dropna())
-                if by_sequence.empty:
-                    continue
-                typical = ratios.typical_ratio(by_sequence)
-                side = ratios.side_of_one(typical["low"], typical["high"])
-                row = {
-                    **variant,
-                    "reference_source": reference["source"],
-                    "reference": reference["method"],
-                    "estimator": estimator,
-                    "metric": metric,
-                    "decides": variant["tested"]
-                    and metric in JUDGING_METRICS
-                    and estimator == judging,
-                    "far_off": ratios.far_off(by_sequence),
-                    **typical,
-                    "verdict": verdict(typical["n"], [side]),
-                    **of_failures,
-                    "ratios": dict(by_sequence),
-                }
-                rows.append(row)
+                if not by_sequence.empty:
+                    decides = may_decide and metric in JUDGING_METRICS
+                    of_metric = {"metric": metric, "decides": decides}
+                    rows.append(of_pair | of_metric | _numbers(by_sequence))
     table = pd.DataFrame(rows, columns=COLUMNS)
     masked = table[table["tested"].astype(bool) & (table["method"] == "masked")]
     table["shown"] = table["tested"] | ~table["source"].isin(masked["source"])
     return table
+
+
+def _numbers(by_sequence: pd.Series) -> dict[str, Any]:
+    """Return the columns of `comparisons_of` that follow from the ratios of the sequences."""
+    typical = ratios.typical_ratio(by_sequence)
+    side = ratios.side_of_one(typical["low"], typical["high"])
+    return {
+        **typical,
+        "far_off": ratios.far_off(by_sequence),
+        "verdict": verdict(typical["n"], [side]),
+        "ratios": dict(by_sequence),
+    }
 
 
 def failures(failed: pd.Series, reference: pd.Series) -> dict[str, Any]:
