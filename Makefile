@@ -87,7 +87,7 @@ $(RUN)/notebooks/%.ipynb:
 	|| { echo "$* failed: $$($(call reason,$(@:.ipynb=.log))) ($(@:.ipynb=.log))" >&2; exit 1; }
 # The drives of the embedded world, and the shared odometry compiled, while the network is trained.
 $(RUN)/drives:
-	@nice $(BIN)/python tools/drives.py && touch $@
+	@nice $(BIN)/python tools/render_ahead.py && touch $@
 # The last line of a log is the error, but not if the kernel died: then it is what the kernel said, or else memory ran out.
 reason = tr -d '\033' <$(1) | sed 's/\[[0-9;]*m//g' | awk '/^F[0-9]|^Fatal Python error|what\(\):/ && !said {said = $$0} NF {last = $$0} \
   END {print last !~ /DeadKernelError/ ? last : said ? said : "its kernel was killed, most likely because memory ran out"}'
@@ -104,7 +104,7 @@ lint: setup
 	@$(BIN)/ruff format --check --quiet . && $(BIN)/ruff check . && $(BIN)/mypy && $(BIN)/lint-imports --no-logo --no-cache
 # Lessons edit copies, so that the notebooks in git stay as they are. An edited copy is kept.
 lab: setup
-	@lab=$$($(BIN)/python -m thesis.settings) && lab=$${lab%/*}/lab && mkdir -p "$$lab" && \
+	@lab=$$($(BIN)/python -m thesis.run_settings) && lab=$${lab%/*}/lab && mkdir -p "$$lab" && \
 	for path in notebooks/0[1-9]_*.ipynb notebooks/thesis; do test -e "$$lab/$${path#*/}" || cp -r "$$path" "$$lab"; done && \
 	echo "the notebooks are copies in $$lab; delete one to get it anew. One that was idle for an hour loses its memory:" && \
 	echo "run its cells again. Open the address below:" && \

@@ -2,7 +2,7 @@
 
 import json
 
-from thesis.settings import ROOT
+from thesis.run_settings import ROOT
 
 NOTEBOOKS = sorted(path.name for path in (ROOT / "notebooks").glob("*.ipynb"))
 

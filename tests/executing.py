@@ -6,7 +6,7 @@ import nbformat
 from cells import NOTEBOOKS
 from nbclient import NotebookClient
 
-from thesis.settings import PREFIX, ROOT
+from thesis.run_settings import PREFIX, ROOT
 
 # what a kernel sees of this process's variables: nothing that the Makefile sets
 KEPT = ("PATH", "HOME", "LANG", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")

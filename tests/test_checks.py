@@ -9,7 +9,7 @@ import pytest
 from made_up import winding
 
 from thesis import run
-from thesis.settings import read_settings
+from thesis.run_settings import read_settings
 from thesis_repro import checks
 from thesis_repro.command.cli import main
 from thesis_repro.data.sequence import Sequence

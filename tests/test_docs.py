@@ -14,7 +14,7 @@ import pytest
 from street import Street
 
 import thesis_repro as tr
-from thesis.settings import ROOT
+from thesis.run_settings import ROOT
 from thesis_repro.command import cli
 from thesis_repro.command.options import build_parser
 from thesis_repro.data.cameras import read_camera

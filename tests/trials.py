@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import pandas as pd
 
-from thesis.settings import ROOT
+from thesis.run_settings import ROOT
 from thesis_repro.running import files
 from thesis_repro.segmentation import ARITHMETIC
 

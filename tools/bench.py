@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from thesis.settings import ROOT
+from thesis.run_settings import ROOT
 from thesis_repro import odometry
 from thesis_repro.data.sequence import Sequence
 from thesis_repro.odometry import THESIS, loop, sharing

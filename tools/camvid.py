@@ -21,9 +21,8 @@ from keypoint_study.jobs import CONTROL_WIDTH
 from keypoint_study.plan import Study
 from keypoint_study.report import comparison, style
 from keypoint_study.sources import Source
-from thesis import map_quality
-from thesis.reported import REPORTED
-from thesis.settings import PROFILES, ROOT
+from thesis import REPORTED, map_quality
+from thesis.run_settings import PROFILES, ROOT
 from thesis_repro.data import cityscapes, kitti
 from thesis_repro.data.sequence import Sequence
 from thesis_repro.running import files, program, provenance

@@ -18,8 +18,8 @@ import pandas as pd
 from keypoint_study import comparisons, jobs, ratios, runner
 from keypoint_study.report import style, texts
 from keypoint_study.sources import Source
-from thesis import chapter4, excerpts, few_keypoints, section_4_2, timing
-from thesis.settings import read_settings
+from thesis import chapter4, few_keypoints, real_streets, tables, timing
+from thesis.run_settings import read_settings
 from thesis_repro.data import kitti
 from thesis_repro.data.sequence import Sequence
 from thesis_repro.errors import InputError
@@ -27,7 +27,7 @@ from thesis_repro.odometry import metrics
 from thesis_repro.running import program, provenance
 from thesis_repro.running.files import needed, write_text
 
-FOLDER = excerpts.FOLDER
+FOLDER = real_streets.FOLDER
 # Figures and tables of notebooks 8 and 9. Other notebooks draw frames, which are not ours to give.
 KEPT = (
     *(f"figure_4_{number:02d}" for number in (6, 7, 9, 10, 11, 12, 17)),
@@ -108,12 +108,12 @@ def write(settings, folder):
     for name, rows in for_readers.items():
         timed_on = f"; {timing.told(times)}" if name == "few_keypoints" else ""
         style.save_table(rows, folder, name, note + timed_on)
-    tables = {name: _read(settings, name) for name in RUNS} | {
+    of_runs = {name: _read(settings, name) for name in RUNS} | {
         "few_keypoints_runs": few_runs,
         "every_second_runs": second_runs,
         "refined_widths_runs": of_widths,
     }
-    for name, rows in tables.items():
+    for name, rows in of_runs.items():
         # six digits are enough: shuffling the matched points changes more
         text = rows.to_csv(index=False, lineterminator="\n", float_format="%.6g")
         write_text(folder / f"{name}.csv", text)
@@ -140,7 +140,7 @@ def draw(folder):
     note = (folder / "table_4_1.md").read_text(encoding="utf-8").splitlines()[-1]
     runs = pd.read_csv(folder / "runs.csv", dtype={"sequence": str}, low_memory=False)
     runs = runs[runs["estimator"] == "thesis"]
-    best = section_4_2.of_chosen_width(runs[runs["method"] == "masked"])
+    best = tables.of_chosen_width(runs[runs["method"] == "masked"])
     shown = pd.concat([runs[runs["method"].isin(["baseline", "reduced"])], best])
     figures = {
         "figure_4_13": chapter4.figure_of_bars(shown, "rmse"),
@@ -175,7 +175,7 @@ def runs_of_every_second(settings, sequences, labels):
     """Run masks and few spread keypoints with every second frame: KITTI at 5 frames a second."""
     folder = settings.build / "every_second"
     thinned = [
-        excerpts.cut(each, 0, len(each) - 1, folder / "frames", each.name, every=2)
+        real_streets.cut(each, 0, len(each) - 1, folder / "frames", each.name, every=2)
         for each in sequences
     ]
     return few_keypoints.run_few(
@@ -245,7 +245,7 @@ def _streets(sequences):
 
 def folder_of(settings):
     """Return the folder of the evidence: the one in git for its own frames alone, at its sizes."""
-    if excerpts.is_evidence(settings):
+    if real_streets.is_evidence(settings):
         return FOLDER
     program.log.info(
         "evidence: these are not the frames and sizes of the evidence in git, which stays as it is"

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pandas as pd
 
-from thesis import excerpts
-from thesis.settings import ROOT
+from thesis import real_streets
+from thesis.run_settings import ROOT
 from thesis_repro.data.sequence import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.running import program
@@ -36,15 +36,15 @@ def opened(street: pd.Series, kitti_root: str, raw_root: str) -> Sequence:
 def cut_streets(kitti_root: str, raw_root: str, folder: Path) -> dict[str, str]:
     """Cut all streets of the manifest, and return what differs or is missing, by street."""
     told = {}
-    manifest = excerpts.read_manifest()
+    manifest = real_streets.read_manifest()
     for name, street in progress(list(manifest.iterrows()), "cutting", unit="street"):
         try:
             sequence = opened(street, kitti_root, raw_root)
-            made = excerpts.cut(sequence, street["first"], street["last"], folder, name)
+            made = real_streets.cut(sequence, street["first"], street["last"], folder, name)
         except InputError as error:
             told[name] = f"missing: {error}"
             continue
-        parts = excerpts.differences(made, street)
+        parts = real_streets.differences(made, street)
         if parts:
             told[name] = f"other {' and '.join(parts)} than the evidence's ({street['made']})"
     return told
@@ -56,7 +56,7 @@ def main(arguments: list[str]) -> int:
     told = cut_streets(kitti_root, raw_root, FOLDER)
     for name, text in told.items():
         program.log.warning(f"{name}: {text}")
-    count = len(excerpts.read_manifest())
+    count = len(real_streets.read_manifest())
     program.summary(f"{count - len(told)} of {count} streets are those of the evidence: {FOLDER}")
     return int(bool(told))
 

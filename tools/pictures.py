@@ -11,8 +11,8 @@ import numpy as np
 
 import thesis_repro as tr
 from keypoint_study.report import style
-from thesis import excerpts, frames
-from thesis.settings import ROOT
+from thesis import real_streets, views
+from thesis.run_settings import ROOT
 from thesis_repro.data.cityscapes import read_label_map
 from thesis_repro.data.sequence import Sequence
 from thesis_repro.errors import InputError
@@ -20,7 +20,7 @@ from thesis_repro.odometry.loop import OPENCV, detect, normalise
 from thesis_repro.running import program
 from thesis_repro.segmentation import prediction
 
-FOLDER = excerpts.FOLDER / "pictures"
+FOLDER = real_streets.FOLDER / "pictures"
 WIDTH = 10  # dilation width of masks, pixels
 FEW_SPREAD = 200  # spread keypoints
 DIMMED = 2  # times darker beside the mask
@@ -37,7 +37,7 @@ NOTE = (
 def opened(root, name):
     """Open a street of the evidence. Raises InputError if its frames are others."""
     sequence = Sequence(root, name)
-    if excerpts.differences(sequence, excerpts.read_manifest().loc[name]):
+    if real_streets.differences(sequence, real_streets.read_manifest().loc[name]):
         raise InputError(f"{sequence.folder}: has other frames than the evidence; make excerpts")
     return sequence
 
@@ -56,8 +56,8 @@ def street_and_masks(sequence, labels):
     whole = {f"the mask: boundaries, widened to {WIDTH} pixels": mask}
     spread = {f"{len(few)} spread over the frame": (frame, few)}
     return {
-        "masks": frames.pictures(frame, first | whole | on_mask, 2, [label_map]),
-        "spread": frames.pictures(frame, first | on_mask | spread, 2, [label_map]),
+        "masks": views.pictures(frame, first | whole | on_mask, 2, [label_map]),
+        "spread": views.pictures(frame, first | on_mask | spread, 2, [label_map]),
     }
 
 
@@ -99,7 +99,7 @@ def tracks_and_outliers(sequence):
     inliers = inliers.ravel() > 0
     text = f"{inliers.sum()} tracks agree on one motion (green), {(~inliers).sum()} do not (orange)"
     text = f"KITTI raw {sequence.name}, frame {TRACK_FRAME + 1}: {text}"
-    return {"tracks": frames.tracks(now, old, new, text, inliers)}
+    return {"tracks": views.tracks(now, old, new, text, inliers)}
 
 
 @style.applied()

@@ -8,7 +8,7 @@ import subprocess
 import tempfile
 from pathlib import Path
 
-from thesis.settings import ROOT
+from thesis.run_settings import ROOT
 from thesis_repro.errors import InputError
 from thesis_repro.running import program
 from thesis_repro.running.files import write_text

@@ -9,7 +9,7 @@ import json
 
 from keypoint_study.sources import Source
 from thesis import artefacts, few_keypoints, timing
-from thesis.settings import read_settings
+from thesis.run_settings import read_settings
 from thesis_repro.data import kitti
 from thesis_repro.data.sequence import Sequence
 from thesis_repro.masks import MaskSettings

@@ -14,7 +14,7 @@ import pandas as pd
 from keypoint_study import comparisons, ratios, verdicts
 from keypoint_study.report import texts
 from thesis import claims, equal_number, few_keypoints, gallery
-from thesis.settings import ROOT, read_settings
+from thesis.run_settings import ROOT, read_settings
 from thesis_repro.command import cli
 from thesis_repro.command.options import build_parser
 from thesis_repro.running import program

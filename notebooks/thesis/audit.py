@@ -15,7 +15,7 @@ import pandas as pd
 
 from keypoint_study import ratios
 from keypoint_study.report import style
-from thesis.reported import REPORTED
+from thesis import REPORTED
 
 ROWS = json.loads((Path(__file__).parent / "audit.json").read_text(encoding="utf-8"))["rows"]
 MEASURED = {row["row"]: row.pop("measured", {}) for row in ROWS}  # {row: {key: what is measured}}

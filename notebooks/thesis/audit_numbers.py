@@ -18,10 +18,9 @@ from keypoint_study.jobs import Job, repeated, runs_of
 from keypoint_study.methods import ABLATION, of_group
 from keypoint_study.runner import run_all, run_poses
 from keypoint_study.sources import Source
-from thesis import artefacts, audit, earlier, map_quality, section_4_2, timing
+from thesis import REPORTED, artefacts, audit, map_quality, tables, timing
 from thesis.audit import CHANGES, WIDTHS, measurement, ratio, share
-from thesis.reported import REPORTED
-from thesis.settings import Settings
+from thesis.run_settings import Settings
 from thesis_repro.data.cityscapes import CLASS_WEIGHTS, ID, LABELS
 from thesis_repro.data.sequence import Sequence
 from thesis_repro.odometry import metrics
@@ -172,11 +171,11 @@ def _of_changes(metric: str) -> list[dict[str, Any]]:
 def of_study(runs: pd.DataFrame, shuffled: pd.DataFrame) -> list[dict[str, Any]]:
     """Return the rows that follow from the runs of notebook 08.
 
-    shuffled: its repetitions of all keypoints, see `section_4_2.null_distribution`.
+    shuffled: its repetitions of all keypoints, see `tables.null_distribution`.
     """
     run = partial(of_method, runs)
     every, masks = run("baseline"), run("masked", [comparisons.tested_width(runs)])
-    best = section_4_2.of_chosen_width(comparisons.of_method(runs, "masked"))
+    best = tables.of_chosen_width(comparisons.of_method(runs, "masked"))
     other_widths = [*range(1, 9), *range(12, 16)]
     corrected = run("corrected")
     over_20_m = ("translation_percent", "rotation_deg_per_100m")
@@ -205,18 +204,18 @@ def _of_best_widths(
 ) -> list[dict[str, Any]]:
     """Return rows 2, 35 and 39. best: the runs with masks of each sequence's best width."""
     masked, every = comparisons.of_method(runs, "masked"), comparisons.of_method(runs, "baseline")
-    stability = section_4_2.stability(masked, every)
-    nine_to_11 = section_4_2.best_widths(masked)["dilation_width"].isin(WIDTHS).sum()
+    stability = tables.stability(masked, every)
+    nine_to_11 = tables.best_widths(masked)["dilation_width"].isin(WIDTHS).sum()
     lines = [
         ratio("2", "same runs", ratios.ratios_of(best, every, "rmse"), metric="RMSE"),
         measurement("35", "best", nine_to_11, "sequences"),
         ratio("2", "other repetitions", stability["elsewhere"], metric="RMSE"),
         share("2", "same best", stability["same_best"]),
     ]
-    studies = section_4_2.null_distribution(shuffled, masked["dilation_width"].nunique(), "rmse")
+    studies = tables.null_distribution(shuffled, masked["dilation_width"].nunique(), "rmse")
     for name in ("mean", "median"):
         values = studies.agg(name, axis=1)
-        low, high = section_4_2.middle(values)
+        low, high = tables.middle(values)
         line = measurement("39", name, values.mean(), "%", metric="RMSE")
         lines.append({**line, "low": low, "high": high, "n": len(studies)})
     return lines
@@ -311,7 +310,7 @@ def measurements_of_run(
     whose boundaries are measured. Writes ablations.csv. Rows of notebooks that were not run have no
     numbers.
     """
-    labels = earlier.label_maps()
+    labels = artefacts.label_maps()
     ablated = run_ablations(drives, labels, settings.build / "audit", repetitions, settings.jobs)
     artefacts.write_text("ablations.csv", ablated.to_csv(index=False))
     return [
@@ -352,7 +351,7 @@ def of_earlier_notebooks(settings: Settings, count: int) -> list[dict[str, Any]]
     """
     measurements: list[dict[str, Any]] = []
     if (settings.build / "shuffled_runs.csv").is_file():
-        measurements += of_study(*earlier.results()[:2])
+        measurements += of_study(*artefacts.results()[:2])
         measurements += of_times(settings)
     else:
         print("notebook 8 was not run, so rows that need its runs have no number")

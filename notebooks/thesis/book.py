@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 from thesis import gallery
-from thesis.settings import ROOT, Settings, read_settings
+from thesis.run_settings import ROOT, Settings, read_settings
 from thesis_repro.errors import InputError
 from thesis_repro.running import program
 from thesis_repro.running.files import listed

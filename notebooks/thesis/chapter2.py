@@ -243,7 +243,7 @@ def figure_2_11(
     """Figure 2.11: one scene from two viewpoints, with the keypoints of both and of one frame.
 
     in_both: the same keypoints in the first and in the second frame, a pair of arrays. lost, new:
-    those of the first and of the second frame only (see `flicker.found_again`). All arrays are
+    those of the first and of the second frame only (see `views.found_again`). All arrays are
     (n, 2) pixels.
     """
     figure, axes = style.frame_panels(first, 2)

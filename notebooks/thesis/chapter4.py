@@ -29,8 +29,8 @@ from keypoint_study.report.style import (
     REDUCED,
     TRUTH,
 )
-from thesis import frames
-from thesis.flicker import View
+from thesis import views
+from thesis.views import View
 
 DRAWN_METHODS = {
     "baseline": ("all keypoints", BASELINE),
@@ -60,7 +60,7 @@ def figure_4_04(
     figure, (axes,) = style.frame_panels(frame)
     bright = max(np.percentile(frame, 98), 1)
     brighter = np.clip(230 * (frame / bright) ** 0.6, 0, 255).astype(np.uint8)
-    style.show_image(axes, frames.with_edges(brighter, edge_image), title)
+    style.show_image(axes, views.with_edges(brighter, edge_image), title)
     axes.scatter(*keypoints.T, s=9, color=KEYPOINT["color"], edgecolors="black", linewidths=0.4)
     return figure
 
@@ -69,19 +69,19 @@ def figure_4_04(
 RING: dict[str, Any] = {"s": 34, "facecolors": "none", "edgecolors": PINK, "linewidths": 1.1}
 
 
-def figure_4_08(views: list[View], title: str) -> plt.Figure:
+def figure_4_08(windows: list[View], title: str) -> plt.Figure:
     """Figure 4.8: one place in consecutive frames, where keypoints jump.
 
-    views: from `flicker.follow_window`.
+    windows: from `views.follow_window`.
     """
-    figure, axes = style.new_figure(1, len(views), height=3.4)
-    for panel, view in zip(axes, views, strict=True):
+    figure, axes = style.new_figure(1, len(windows), height=3.4)
+    for panel, view in zip(axes, windows, strict=True):
         height, width = view.crop.shape
         text = f"frame {view.frame}: {len(view.keypoints)} keypoints"
         if view.expected is not None:
             text += f";\n{view.jumped} of {len(view.expected)} rings without a keypoint"
             panel.scatter(*view.expected.T, **RING)
-        style.show_image(panel, frames.with_edges(view.crop, view.edges), text)
+        style.show_image(panel, views.with_edges(view.crop, view.edges), text)
         panel.scatter(*view.keypoints.T, **{**KEYPOINT, "s": 12})
         # a circle at the border would widen the panel
         panel.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
@@ -222,7 +222,7 @@ def figure_against_width(masked: pd.DataFrame, baseline: pd.DataFrame, metric: s
         title=f"{metric.upper()} against dilation width, by sequence",
     )
     of_all = ratios.range_over_repetitions(baseline, metric)
-    _, panels = frames.small_panels(names, "width (pixels)", below)
+    _, panels = views.small_panels(names, "width (pixels)", below)
     for panel, name in zip(panels, names, strict=True):
         bars, band = errors.loc[name], of_all.loc[name]
         panel.vlines(
@@ -329,7 +329,7 @@ def panels_of_bars(runs: pd.DataFrame, metric: str) -> plt.Figure:
     runs, metric: as for `bars`.
     """
     names = sorted(runs["sequence"].unique())
-    figure, panels = frames.small_panels(names)
+    figure, panels = views.small_panels(names)
     for panel, name in zip(panels, names, strict=True):
         bars(panel, runs[runs["sequence"] == name], metric)
         panel.set(xticks=[], xlabel="")

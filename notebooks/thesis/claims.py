@@ -30,8 +30,7 @@ from keypoint_study import comparisons, ratios, verdicts
 from keypoint_study.jobs import CONTROL_WIDTH
 from keypoint_study.path_errors import ERRORS
 from keypoint_study.report import style, texts
-from thesis import audit, equal_number, section_4_2
-from thesis.reported import REPORTED
+from thesis import REPORTED, audit, equal_number, tables
 from thesis_repro.odometry import THESIS
 
 REPRODUCED, NOT_REPRODUCED = "reproduced", "not reproduced"
@@ -203,14 +202,14 @@ class Tables:
 
 def claims_of(read: Callable[[str], pd.DataFrame]) -> list[Claim]:
     """Return what became of each claim. read: of a table in figures, by name."""
-    tables = Tables(read)
+    at_hand = Tables(read)
     return [
-        *_of_errors(tables),
-        *_of_widths(tables),
-        *_of_keypoints(tables),
-        *_of_time(tables),
-        *_of_causes(tables),
-        *_of_the_network(tables),
+        *_of_errors(at_hand),
+        *_of_widths(at_hand),
+        *_of_keypoints(at_hand),
+        *_of_time(at_hand),
+        *_of_causes(at_hand),
+        *_of_the_network(at_hand),
     ]
 
 
@@ -233,15 +232,15 @@ def text_of_claims(claims: list[Claim], note: str) -> str:
     )
 
 
-def _of_errors(tables: Tables) -> list[Claim]:
+def _of_errors(at_hand: Tables) -> list[Claim]:
     """Return the claims about errors with masks, in the order of Section 4.2."""
-    rmse, mae = (Procedure.on(tables, metric) for metric in ("rmse", "mae"))
+    rmse, mae = (Procedure.on(at_hand, metric) for metric in ("rmse", "mae"))
     return [
-        _aggregate(tables, rmse, "13.2"),
-        _aggregate(tables, mae, "25.65"),
-        _most_sequences(tables, rmse),
-        _as_well(tables),
-        _named_sequences(tables, rmse),
+        _aggregate(at_hand, rmse, "13.2"),
+        _aggregate(at_hand, mae, "25.65"),
+        _most_sequences(at_hand, rmse),
+        _as_well(at_hand),
+        _named_sequences(at_hand, rmse),
     ]
 
 
@@ -257,18 +256,18 @@ class Procedure(NamedTuple):
     studies: pd.DataFrame
 
     @classmethod
-    def on(cls, tables: Tables, metric: str) -> "Procedure":
+    def on(cls, at_hand: Tables, metric: str) -> "Procedure":
         """Apply the procedure to the runs at hand."""
-        masked, every = tables.every_width(), tables.runs_of("baseline")
+        masked, every = at_hand.every_width(), at_hand.runs_of("baseline")
         widths = masked["dilation_width"].nunique()
-        changes = section_4_2.changes_of_repetition(masked, every, metric)
-        return cls(metric, changes, section_4_2.null_distribution(tables.shuffled, widths, metric))
+        changes = tables.changes_of_repetition(masked, every, metric)
+        return cls(metric, changes, tables.null_distribution(at_hand.shuffled, widths, metric))
 
 
-def _aggregate(tables: Tables, found: Procedure, printed: str) -> Claim:
+def _aggregate(at_hand: Tables, found: Procedure, printed: str) -> Claim:
     """Return the claim on a sum of percentages. printed: in the thesis."""
     name, changes, by_chance = found.metric.upper(), found.changes, found.studies.mean(axis=1)
-    low, high = section_4_2.middle(by_chance)
+    low, high = tables.middle(by_chance)
     return Claim(
         f"aggregate {found.metric}",
         "4.2, 5.1",
@@ -277,16 +276,16 @@ def _aggregate(tables: Tables, found: Procedure, printed: str) -> Claim:
         f"Mean {changes.mean():.2f} %; if masks did nothing, {by_chance.mean():.2f} % "
         f"({low:.2f} to {high:.2f}).",
         against_chance(changes.mean(), by_chance),
-        f"Sum here: {changes.sum():.0f} %. Width {tables.width}, fixed before: "
-        f"{_ratio(tables.over('masked', found.metric))} times the error of all keypoints.",
+        f"Sum here: {changes.sum():.0f} %. Width {at_hand.width}, fixed before: "
+        f"{_ratio(at_hand.over('masked', found.metric))} times the error of all keypoints.",
     )
 
 
-def _most_sequences(tables: Tables, found: Procedure) -> Claim:
+def _most_sequences(at_hand: Tables, found: Procedure) -> Claim:
     """Return the claim that errors fall on most sequences."""
     improved, by_luck = (found.changes < 0).sum(), (found.studies < 0).sum(axis=1)
     in_tables = (audit.CHANGES < 0).sum()
-    fixed = tables.over("masked", "rmse")
+    fixed = at_hand.over("masked", "rmse")
     return Claim(
         "most sequences",
         "4.2, 5.1",
@@ -295,26 +294,26 @@ def _most_sequences(tables: Tables, found: Procedure) -> Claim:
         f"RMSE lower on {improved} of {len(found.changes)}; on {by_luck.mean():.2f} if masks did "
         "nothing.",
         against_chance(-improved, -by_luck.to_numpy()),
-        f"Width {tables.width}: lower on {(fixed < 1).sum()} of {len(fixed)}.",
+        f"Width {at_hand.width}: lower on {(fixed < 1).sum()} of {len(fixed)}.",
     )
 
 
-def _as_well(tables: Tables) -> Claim:
+def _as_well(at_hand: Tables) -> Claim:
     """Return the claim that masks do as well as all keypoints."""
-    fixed = tables.over("masked", "rmse")
-    shuffles = ratios.range_of_shuffles(tables.runs).query("estimator == 'thesis'")["factor"]
+    fixed = at_hand.over("masked", "rmse")
+    shuffles = ratios.range_of_shuffles(at_hand.runs).query("estimator == 'thesis'")["factor"]
     refined = pd.DataFrame(
-        {error: tables.over("masked", error, "refined") for error in comparisons.JUDGING_METRICS}
+        {error: at_hand.over("masked", error, "refined") for error in comparisons.JUDGING_METRICS}
     )
     equal, places = (
-        equal_number.over(*_few(tables.few, (choice, 200), ("random", 200)))
+        equal_number.over(*_few(at_hand.few, (choice, 200), ("random", 200)))
         for choice in ("mask", "random-on")
     )
     return Claim(
         "as well",
         "4, 4.2, 5.1",
         "Masks do as well as all keypoints, or slightly better.",
-        f"Width {tables.width}: RMSE {_ratio(fixed)} times that of all, higher on "
+        f"Width {at_hand.width}: RMSE {_ratio(fixed)} times that of all, higher on "
         f"{(fixed > 1).sum()} of {len(fixed)}.",
         is_as_good(fixed),
         "Within the numerical accuracy, says the thesis: shuffling the points alone changes the RMSE "
@@ -331,11 +330,11 @@ def _judged(of_streets: pd.DataFrame) -> str:
     return f"{errors}: {equal_number.word(of_streets)}"
 
 
-def _named_sequences(tables: Tables, found: Procedure) -> Claim:
+def _named_sequences(at_hand: Tables, found: Procedure) -> Claim:
     """Return the claim on sequences on which masks do well."""
     changes = found.changes
     shown = ", ".join(f"{name} {changes[name]:+.0f} %" for name in NAMED if name in changes)
-    failed = [_failed(tables.runs_of(method), "01") for method in ("masked", "baseline")]
+    failed = [_failed(at_hand.runs_of(method), "01") for method in ("masked", "baseline")]
     return Claim(
         "named sequences",
         "4.2",
@@ -346,14 +345,14 @@ def _named_sequences(tables: Tables, found: Procedure) -> Claim:
     )
 
 
-def _of_widths(tables: Tables) -> list[Claim]:
+def _of_widths(at_hand: Tables) -> list[Claim]:
     """Return the claims about the dilation width."""
-    masked = tables.every_width()
-    best = section_4_2.best_widths(masked)["dilation_width"].isin(audit.WIDTHS)
+    masked = at_hand.every_width()
+    best = tables.best_widths(masked)["dilation_width"].isin(audit.WIDTHS)
     kept = masked.groupby(["sequence", "dilation_width"])["mean_keypoints"].mean().unstack()
     rising = kept.diff(axis=1).iloc[:, 1:].gt(0).all(axis=1)
-    same = tables.measured("2", "same best")
-    others = tables.measured("35", "9 to 11", estimator="thesis")
+    same = at_hand.measured("2", "same best")
+    others = at_hand.measured("35", "9 to 11", estimator="thesis")
     return [
         Claim(
             "widths",
@@ -374,21 +373,21 @@ def _of_widths(tables: Tables) -> list[Claim]:
     ]
 
 
-def _of_keypoints(tables: Tables) -> list[Claim]:
+def _of_keypoints(at_hand: Tables) -> list[Claim]:
     """Return the claims about the number of keypoints."""
-    masked = tables.every_width()
-    best = section_4_2.best_widths(masked)["mean_keypoints"]
+    masked = at_hand.every_width()
+    best = tables.best_widths(masked)["mean_keypoints"]
     factor = ratios.typical_ratio(LIMIT / best)
     reported = pd.DataFrame(REPORTED["table_4_1"])["mean_keypoints"]
-    fixed = tables.runs_of("masked").groupby("sequence")["mean_keypoints"].mean()
-    every = tables.runs_of("baseline").groupby("sequence")["mean_keypoints"].mean()
+    fixed = at_hand.runs_of("masked").groupby("sequence")["mean_keypoints"].mean()
+    every = at_hand.runs_of("baseline").groupby("sequence")["mean_keypoints"].mean()
     low, high = ratios.mean_interval(best)
-    reduced, few = tables.over("reduced", "rmse"), tables.over("fewer", "se3")
-    of_masks = tables.measured("33", "over best", estimator="thesis")
-    fewer = tables.over("fewer", "rmse")
-    tenth = tables.measured("59", "dropout", **RMSE_OF_THESIS)
-    failing, failing_of_all = _failing(tables, "dropout"), _failing(tables, "baseline")
-    spread = equal_number.over(*_few(tables.few, ("spread", 200), ("all", 0)))
+    reduced, few = at_hand.over("reduced", "rmse"), at_hand.over("fewer", "se3")
+    of_masks = at_hand.measured("33", "over best", estimator="thesis")
+    fewer = at_hand.over("fewer", "rmse")
+    tenth = at_hand.measured("59", "dropout", **RMSE_OF_THESIS)
+    failing, failing_of_all = _failing(at_hand, "dropout"), _failing(at_hand, "baseline")
+    spread = equal_number.over(*_few(at_hand.few, ("spread", 200), ("all", 0)))
     return [
         Claim(
             "fewer",
@@ -397,7 +396,7 @@ def _of_keypoints(tables: Tables) -> list[Claim]:
             f"{LIMIT / reported.mean():.1f}.)",
             f"Best widths: {_ratio(LIMIT / best, False)} times fewer than {LIMIT}.",
             is_within((factor["low"], factor["high"]), REDUCTION[0], REDUCTION[1], len(best)),
-            f"Width {tables.width}: {every.mean() / fixed.mean():.1f} times, {every.mean():.0f} to "
+            f"Width {at_hand.width}: {every.mean() / fixed.mean():.1f} times, {every.mean():.0f} to "
             f"{fixed.mean():.0f}.",
         ),
         Claim(
@@ -415,9 +414,9 @@ def _of_keypoints(tables: Tables) -> list[Claim]:
             "As few keypoints without masks have significantly higher errors.",
             f"RMSE {_ratio(reduced)} times that of all.",
             is_on_side(reduced, 1),
-            f"Rotation {_ratio(tables.over('reduced', 'rotation'))}. RMSE over masks of the best width: "
+            f"Rotation {_ratio(at_hand.over('reduced', 'rotation'))}. RMSE over masks of the best width: "
             f"{_numbers(of_masks)}. Aligned ATE of the strongest, as "
-            f"many as masks of width {tables.width} leave: {_ratio(few)}.",
+            f"many as masks of width {at_hand.width} leave: {_ratio(few)}.",
         ),
         Claim(
             "more keypoints",
@@ -438,18 +437,18 @@ def _of_keypoints(tables: Tables) -> list[Claim]:
     ]
 
 
-def _of_time(tables: Tables) -> list[Claim]:
+def _of_time(at_hand: Tables) -> list[Claim]:
     """Return the claims about time. Times are those of the machine that made the evidence."""
-    total, typical = tables.measured("47", "together"), tables.measured("47", "typical")
-    of_all_cores = tables.measured("47", "typical", threads=tables.threads)
-    narrow = tables.measured("47", "narrow")
-    whole = tables.measured("16", "network")
+    total, typical = at_hand.measured("47", "together"), at_hand.measured("47", "typical")
+    of_all_cores = at_hand.measured("47", "typical", threads=at_hand.threads)
+    narrow = at_hand.measured("47", "narrow")
+    whole = at_hand.measured("16", "network")
     return [
         Claim(
             "time",
             "4.2, 5.1",
             "Widths of 9 to 11 save 5 to 10 % of the time.",
-            f"{audit.on('One machine', tables.threads)}: {_saved(of_all_cores)}.",
+            f"{audit.on('One machine', at_hand.threads)}: {_saved(of_all_cores)}.",
             is_within(_saved_ends(of_all_cores), SAVED[0], SAVED[1], of_all_cores["n"]),
             f"On one thread: {_saved(typical)}; all streets together (Equation 4.2): "
             f"{-total['value']:.0f} %. "
@@ -466,15 +465,15 @@ def _of_time(tables: Tables) -> list[Claim]:
     ]
 
 
-def _of_causes(tables: Tables) -> list[Claim]:
+def _of_causes(at_hand: Tables) -> list[Claim]:
     """Return the claims about what causes errors."""
-    turns = tables.over("masked", "in_turns")
-    steady = tables.measured("38", "steady", "embedded", estimator="refined")
-    on_01 = ratios.has_failed(tables.runs_of("baseline").query("sequence == '01'"))
-    refined_on_01 = _failed(tables.runs_of("baseline", "refined"), "01")
-    thin, thin_high = tables.measured("87", "thin 5/15"), tables.measured("87", "thin 20/60")
-    lost = tables.measured("73", "lost", metric="all")
-    lost_on_masks = tables.measured("73", "lost", metric="on predicted boundaries")
+    turns = at_hand.over("masked", "in_turns")
+    steady = at_hand.measured("38", "steady", "embedded", estimator="refined")
+    on_01 = ratios.has_failed(at_hand.runs_of("baseline").query("sequence == '01'"))
+    refined_on_01 = _failed(at_hand.runs_of("baseline", "refined"), "01")
+    thin, thin_high = at_hand.measured("87", "thin 5/15"), at_hand.measured("87", "thin 20/60")
+    lost = at_hand.measured("73", "lost", metric="all")
+    lost_on_masks = at_hand.measured("73", "lost", metric="on predicted boundaries")
     return [
         Claim(
             "sequence 01",
@@ -490,7 +489,7 @@ def _of_causes(tables: Tables) -> list[Claim]:
             "Masks lose accuracy in turns, where half of the scene is new.",
             f"Rotation errors in turns: {_ratio(turns)} times those of all.",
             is_on_side(turns, 1),
-            f"Refined estimator: {_ratio(tables.over('masked', 'in_turns', 'refined'))}.",
+            f"Refined estimator: {_ratio(at_hand.over('masked', 'in_turns', 'refined'))}.",
         ),
         Claim(
             "changing boundaries",
@@ -534,13 +533,13 @@ def _of_causes(tables: Tables) -> list[Claim]:
     ]
 
 
-def _of_the_network(tables: Tables) -> list[Claim]:
+def _of_the_network(at_hand: Tables) -> list[Claim]:
     """Return the claims about the network. Cityscapes is not at hand."""
-    small = tables.measured("86", "small", "embedded")["value"]
-    large = tables.measured("86", "large", "embedded")["value"]
-    library = tables.measured("20", "library", "embedded")["value"]
-    whole = tables.measured("20", "whole", "embedded")["value"]
-    sky = tables.measured("46", "sky", "embedded")["value"]
+    small = at_hand.measured("86", "small", "embedded")["value"]
+    large = at_hand.measured("86", "large", "embedded")["value"]
+    library = at_hand.measured("20", "library", "embedded")["value"]
+    whole = at_hand.measured("20", "whole", "embedded")["value"]
+    sky = at_hand.measured("46", "sky", "embedded")["value"]
     return [
         Claim(
             "scores",
@@ -586,9 +585,9 @@ def _few(
     return [few[(few["choice"] == name) & (few["number"] == n)] for name, n in (chosen, other)]
 
 
-def _failing(tables: Tables, method: str) -> int:
+def _failing(at_hand: Tables, method: str) -> int:
     """Return on how many streets an ablation fails."""
-    runs = comparisons.of_method(tables.ablations, method, "thesis")
+    runs = comparisons.of_method(at_hand.ablations, method, "thesis")
     return ratios.failing_sequences(ratios.has_failed(runs).set_axis(runs["sequence"]))
 
 

@@ -1,5 +1,13 @@
-"""The gallery: all figures and tables of a run on one page of Markdown, README.md beside them."""
+"""The gallery: all figures and tables of a run on one page of Markdown, README.md beside them.
 
+captions.json has what stands there. An artefact is a dict with kind ("figure", "table",
+"text"), name (of its files), title and caption; those that a study has, too, have the study's.
+Optional keys: constant: true if it shows no data. needs: the variable that a run on real frames
+must set to make it. thesis: what the thesis reports, a dict of data and two Jinja templates, text
+and here (for this run's numbers).
+"""
+
+import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -8,12 +16,32 @@ from typing import Any
 import pandas as pd
 
 from keypoint_study.report import texts
-from thesis import audit, captions, timing
-from thesis.reported import REPORTED
-from thesis.settings import ROOT, Settings, read_settings
+from keypoint_study.report.comparison import CAPTIONS as OF_STUDIES
+from thesis import REPORTED, audit, timing
+from thesis.run_settings import ROOT, Settings, read_settings
 from thesis_repro.running import program, provenance
 from thesis_repro.running.files import atomic, write_text
 
+_CAPTIONS = json.loads((Path(__file__).parent / "captions.json").read_text(encoding="utf-8"))
+# the 36 figures and 5 tables of the thesis in its order, {chapter: artefacts}
+CHAPTERS = _CAPTIONS["chapters"]
+_OF_STUDIES = {
+    ("figure", "comparison"): OF_STUDIES["ratios_drawn"],
+    ("table", "comparison"): OF_STUDIES["ratios"],
+    ("table", "widths"): OF_STUDIES["widths"],
+    ("text", "findings"): ("What the runs show", ""),
+}
+# artefacts that are not in the thesis
+ADDED = [
+    dict(zip(("title", "caption"), _OF_STUDIES.get((artefact["kind"], artefact["name"]), ())))
+    | artefact
+    for artefact in _CAPTIONS["added"]
+]
+# what is to be seen, {name of a figure, or id of a notebook's cell: alternative text}
+SEEN = _CAPTIONS["seen"]
+OF_THESIS = [artefact for artefacts in CHAPTERS.values() for artefact in artefacts]
+THESIS = [artefact["name"] for artefact in OF_THESIS]
+CONSTANT = [artefact["name"] for artefact in OF_THESIS if artefact.get("constant")]
 REAL = "kitti_excerpts"  # folder of the evidence on real frames (tools/evidence.py)
 REAL_CHAPTER = "Chapter 4 on real frames"
 ENDINGS = {"figure": (".svg", ".webp"), "table": (".md",), "text": (".md",)}
@@ -39,7 +67,7 @@ def update(settings: Settings) -> None:
 def _drawn(settings: Settings) -> dict[Path, Path]:
     """Return the files that a run has drawn by name, and those in git that show no data."""
     files = {path.relative_to(settings.figures): path for path in settings.figures.rglob("*.*")}
-    for name in captions.CONSTANT:
+    for name in CONSTANT:
         for path in (ROOT / "figures").glob(f"{name}.*"):
             files.setdefault(Path(path.name), path)
     return files
@@ -70,7 +98,7 @@ def text(settings: Settings) -> str:
     chapters = {}
     if settings.figures_in_git:
         chapters[REAL_CHAPTER] = _of_real_frames(settings)
-    for title, artefacts in (captions.CHAPTERS | {"Beyond the thesis": captions.ADDED}).items():
+    for title, artefacts in (CHAPTERS | {"Beyond the thesis": ADDED}).items():
         chapters[title] = _described(artefacts, settings, settings.published)
     return texts.render("gallery.md.j2", settings=settings, chapters=chapters, real=REAL_CHAPTER)
 
@@ -78,10 +106,10 @@ def text(settings: Settings) -> str:
 def _of_real_frames(settings: Settings) -> list[dict[str, Any]]:
     """Return the described artefacts of the evidence on real frames that is in git."""
     few, others = (
-        [artefact for artefact in captions.ADDED if artefact["name"] in names]
+        [artefact for artefact in ADDED if artefact["name"] in names]
         for names in (["few_keypoints"], ["comparison", "widths"])
     )
-    chapter = [*captions.CHAPTERS["Chapter 4: results"], *few, *others]
+    chapter = [*CHAPTERS["Chapter 4: results"], *few, *others]
     real = replace(settings, kitti_is_embedded=False)
     described = _described(chapter, real, settings.published / REAL)
     for artefact in described:
@@ -104,8 +132,8 @@ def _described(
         paths = [path for end in ENDINGS[kind] if (path := folder / f"{name}{end}").is_file()]
         values: dict[str, Any] = {
             "files": [path.name for path in paths],
-            "number": captions.number(artefact),
-            "seen": captions.SEEN.get(name),
+            "number": number(artefact),
+            "seen": SEEN.get(name),
         }
         if paths and kind == "table":
             values["table"] = paths[0].read_text(encoding="utf-8")
@@ -164,3 +192,11 @@ def main() -> None:
 
 if __name__ == "__main__":
     program.run_main(main)
+
+
+def number(artefact: dict[str, Any]) -> str | None:
+    """Return the number of a figure or table in the thesis: "Figure 4.7" for figure_4_07."""
+    if artefact["name"] not in THESIS:
+        return None
+    kind, chapter, count = artefact["name"].split("_")
+    return f"{kind.capitalize()} {chapter.upper()}.{int(count)}"

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from thesis.settings import Settings
+from thesis.run_settings import Settings
 from thesis_repro import masks
 from thesis_repro.data import cityscapes, kitti
 from thesis_repro.data.cityscapes import ID, read_label_map

@@ -13,8 +13,8 @@ import sys
 from itertools import chain
 from pathlib import Path
 
-from thesis import book, excerpts, gallery
-from thesis.settings import ROOT, Settings, read_settings
+from thesis import book, gallery, real_streets
+from thesis.run_settings import ROOT, Settings, read_settings
 from thesis_repro.checks import report
 from thesis_repro.data import cityscapes, kitti
 from thesis_repro.data.sequence import Sequence
@@ -79,7 +79,7 @@ def check(settings: Settings) -> bool:
     changed: then the notebooks are executed again. Raises InputError if a file is missing.
     """
     for name, first, last in settings.ranges:
-        excerpts.cut(Sequence(settings.whole, name), first, last, settings.kitti, name)
+        real_streets.cut(Sequence(settings.whole, name), first, last, settings.kitti, name)
     path = settings.build / "checked"
     kitti_root = None if settings.kitti_is_embedded else settings.kitti
     cityscapes_root = None if settings.cityscapes_is_embedded else settings.cityscapes

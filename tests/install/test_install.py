@@ -14,7 +14,7 @@ from packaging.requirements import Requirement
 from trials import PACKAGES, copy_project, refused, run, snapshot, succeed
 
 import environment
-from thesis.settings import ROOT
+from thesis.run_settings import ROOT
 from thesis_repro.running import provenance
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -102,7 +102,7 @@ def test_an_installed_package_runs_without_the_extras(
 @pytest.mark.torture
 def test_notebooks_find_their_modules_from_any_folder(tmp_path):
     """As papermill executes them; `make setup` sees to it."""
-    succeed([sys.executable, "-c", "import thesis.settings"], tmp_path, PYTHONPATH=None)
+    succeed([sys.executable, "-c", "import thesis.run_settings"], tmp_path, PYTHONPATH=None)
 
 
 @pytest.mark.slow

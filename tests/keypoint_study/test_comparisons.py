@@ -12,7 +12,7 @@ from scipy.stats import ttest_1samp, wilcoxon
 from keypoint_study import comparisons, ratios
 from keypoint_study.path_errors import ERRORS, path_errors
 from keypoint_study.report import comparison
-from thesis import section_4_2
+from thesis import tables
 
 EIGHT = [f"{number:02d}" for number in range(8)]
 
@@ -279,38 +279,38 @@ def separate_optimum(name, width):
 
 def test_leaving_one_out_shows_that_the_best_width_is_chance():
     masked, baseline = parts_of(separate_optimum)
-    chosen = section_4_2.chosen_widths(masked, baseline)
+    chosen = tables.chosen_widths(masked, baseline)
     assert chosen["best"].tolist() == list(range(1, 12)) and chosen["fixed"].nunique() == 1
     for choice, better in (("best", 11), ("fixed", 1), ("left_out", 0)):
-        rows = section_4_2.of_chosen_width(masked, chosen[choice])
-        changes = section_4_2.changes(rows, baseline, "rmse")
+        rows = tables.of_chosen_width(masked, chosen[choice])
+        changes = tables.changes(rows, baseline, "rmse")
         assert (changes < 0).sum() == better
 
 
 def test_other_repetitions_confirm_a_real_optimum_and_no_chance():
-    real = section_4_2.stability(*parts_of(separate_optimum, noise=0.05))
+    real = tables.stability(*parts_of(separate_optimum, noise=0.05))
     assert (real["same_best"] == 100).all()
     assert np.allclose(real["elsewhere"], 0.5, atol=0.06)
-    chance = section_4_2.stability(*parts_of(lambda *_: 1.0, noise=0.2))
+    chance = tables.stability(*parts_of(lambda *_: 1.0, noise=0.2))
     assert chance["same_best"].mean() < 20
     assert chance["elsewhere"].mean() == pytest.approx(1, abs=0.1)
-    assert section_4_2.stability(*parts_of(separate_optimum, repetitions=1)).isna().all(axis=None)
+    assert tables.stability(*parts_of(separate_optimum, repetitions=1)).isna().all(axis=None)
     masked, baseline = parts_of(separate_optimum)  # only one width has repetitions
     repeated = masked[(masked["repetition"] == 0) | (masked["dilation_width"] == 10)]
-    assert section_4_2.stability(repeated, baseline).isna().all(axis=None)
+    assert tables.stability(repeated, baseline).isna().all(axis=None)
 
 
 def test_the_best_of_many_widths_looks_better_if_masks_do_nothing():
     _, baseline = parts_of(lambda *_: 1.0, repetitions=400, noise=0.2)
-    studies = section_4_2.null_distribution(baseline, 15, "rmse")
-    assert studies.shape == (section_4_2.STUDIES, 11)
+    studies = tables.null_distribution(baseline, 15, "rmse")
+    assert studies.shape == (tables.STUDIES, 11)
     # a standard normal's least of 15 is -1.736 on average, its median 0
     expected = 100 * (np.exp(-1.736 * 0.2) - 1)
     assert studies.median(axis=1).mean() == pytest.approx(expected, abs=2.5)
-    single = section_4_2.null_distribution(baseline, 1, "rmse")
+    single = tables.null_distribution(baseline, 1, "rmse")
     assert single.median(axis=1).mean() == pytest.approx(0, abs=2)
     # the width is chosen by the RMSE, and another error judges it
     other = baseline.assign(mae=1 / baseline["rmse"])
-    assert (section_4_2.null_distribution(other, 15, "mae").mean() > 0).all()
+    assert (tables.null_distribution(other, 15, "mae").mean() > 0).all()
     once = baseline[baseline["repetition"] == 0]
-    assert section_4_2.null_distribution(once, 15, "rmse").empty
+    assert tables.null_distribution(once, 15, "rmse").empty

@@ -13,7 +13,7 @@ from keypoint_study import ablations, comparisons, controls, jobs, methods, runn
 from keypoint_study.jobs import first_jobs, runs_of
 from keypoint_study.methods import Asked
 from keypoint_study.sources import Source
-from thesis import section_4_2
+from thesis import tables
 from thesis_repro import masks
 from thesis_repro.data.sequence import Sequence
 from thesis_repro.masks import folders
@@ -177,7 +177,7 @@ def test_controls_leave_as_many_keypoints_as_masks_of_the_tested_width(
     runs = runner.run_all(runs_of(jobs, opened, [Source(small_labels)]), tmp_path).table
     left = comparisons.keypoints_left(runs, "")
     masked = comparisons.of_method(runs, "masked")
-    jobs += section_4_2.reduced_jobs(section_4_2.best_widths(masked))
+    jobs += tables.reduced_jobs(tables.best_widths(masked))
     jobs += runner.keypoint_controls(runs, opened, [Source(small_labels)], 1, 5)
     assert len({job.name for job in jobs}) == len(jobs)
     runs = runner.run_all(runs_of(jobs, opened, [Source(small_labels)]), tmp_path).table.set_index(

@@ -12,7 +12,7 @@ import pytest
 from keypoint_study import comparisons, methods, runner
 from keypoint_study.jobs import Job, first_jobs, runs_of
 from keypoint_study.sources import Source
-from thesis import section_4_2, timing
+from thesis import tables, timing
 from thesis_repro import masks, odometry
 from thesis_repro.data.sequence import Sequence
 from thesis_repro.errors import InputError
@@ -35,9 +35,7 @@ def finished(small_world, small_labels, tmp_path_factory):
     jobs = first_jobs(opened(small_world), {"thesis": WIDTHS})
     runs = runs_of(jobs, opened(small_world), [Source(small_labels)])
     summary = runner.run_all(runs, folder, processes=2).table
-    jobs += section_4_2.reduced_jobs(
-        section_4_2.best_widths(comparisons.of_method(summary, "masked"))
-    )
+    jobs += tables.reduced_jobs(tables.best_widths(comparisons.of_method(summary, "masked")))
     runs = runs_of(jobs, opened(small_world), [Source(small_labels)])
     return folder, jobs, runner.run_all(runs, folder).table
 
@@ -53,7 +51,7 @@ def test_a_run_equals_the_odometry_of_its_sequence(small_world, small_labels, fi
     )
     assert {name: row[name] for name in expected} == pytest.approx(expected, nan_ok=True, rel=0)
     assert row["se3"] <= row["rmse"]
-    best = section_4_2.best_widths(comparisons.of_method(summary, "masked")).loc["01"]
+    best = tables.best_widths(comparisons.of_method(summary, "masked")).loc["01"]
     least = summary[summary["sequence"] == "01"].groupby("method")[["rmse", "max_keypoints"]].min()
     assert best["rmse"] == least.loc["masked", "rmse"]
     assert least.loc["reduced", "max_keypoints"] == round(best["mean_keypoints"])

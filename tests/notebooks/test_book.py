@@ -12,7 +12,7 @@ from executing import run_of
 
 import thesis_repro as tr
 from thesis import book, gallery
-from thesis.settings import read_settings
+from thesis.run_settings import read_settings
 
 NOT_RUN = NOTEBOOKS[1]
 pytestmark = [pytest.mark.notebooks, pytest.mark.slow]

@@ -7,7 +7,7 @@ import pytest
 from cells import NOTEBOOKS
 from trials import PACKAGES, copy_project, finish, start
 
-from thesis.settings import ROOT
+from thesis.run_settings import ROOT
 
 pytestmark = pytest.mark.notebooks
 FIGURES = [
@@ -71,7 +71,7 @@ def test_a_failing_notebook_does_not_stop_the_others(tmp_path):
     copy_project([*PACKAGES, "notebooks/thesis", "tools", "docs"], root)
     copy_project(["Makefile", "environment.txt", "pyproject.toml"], root)
     (root / ".venv").symlink_to(ROOT / ".venv")
-    (root / "tools" / "drives.py").write_text("")  # it would compile the copy
+    (root / "tools" / "render_ahead.py").write_text("")  # it would compile the copy
     codes = dict.fromkeys(NOTEBOOKS, "print('by hand')")
     codes["02_augmentation.ipynb"] = "raise ValueError('labels: missing')"
     codes["03_unet.ipynb"] = "import os; os.abort()"

@@ -23,8 +23,8 @@ from scipy import stats
 
 import thesis_repro as tr
 from keypoint_study import comparisons
-from thesis import artefacts, audit, earlier, section_4_2
-from thesis.settings import PREFIX, ROOT, read_settings
+from thesis import artefacts, audit, tables
+from thesis.run_settings import PREFIX, ROOT, read_settings
 from thesis_repro import masks
 from thesis_repro.data import cityscapes
 from thesis_repro.errors import InputError
@@ -251,7 +251,7 @@ def test_exercise_05_2(executed, small_world, choose):
     own, package = (columns.filter(like=text) for text in ("of this run", "in the package"))
     assert (package.loc["pixel accuracy"].to_numpy() > own.loc["pixel accuracy"].to_numpy()).all()
     choose(KITTI=small_world / "kitti", FRAMES=5)
-    earlier.label_maps()
+    artefacts.label_maps()
     kept = []
     sequence = tr.Sequence(small_world / "kitti", "00")
     true = cv2.imread(str(sequence.folder / "labels_0" / sequence.frame_paths[0].name), 0)
@@ -303,10 +303,10 @@ def test_a_cell_that_compiles_says_so_once(capsys, monkeypatch):
 
 
 def test_notebook_9_says_whose_runs_it_reads(build):
-    assert "real streets" in run("09", "14", earlier=earlier)["printed"]
+    assert "real streets" in run("09", "14", artefacts=artefacts)["printed"]
     for name in ("runs.csv", "shuffled_runs.csv"):
-        shutil.copy(earlier.EVIDENCE / name, build)
-    assert earlier.results()[2] == "this run"
+        shutil.copy(artefacts.EVIDENCE / name, build)
+    assert artefacts.results()[2] == "this run"
 
 
 def test_lessons_2_and_4_name_the_notebook_that_they_need(build):
@@ -363,12 +363,12 @@ def test_label_maps_of_an_earlier_training_or_of_two_networks_are_named(lessons,
 
 def test_label_maps_by_the_model_in_the_package_are_made_to_the_end(build):
     (build / "labels").unlink()
-    earlier.label_maps()
+    artefacts.label_maps()
     maps = sorted((build / "labels").glob("*/*.png"))
     before = [path.read_bytes() for path in maps]
     for path in maps[3:]:  # as if the notebook was stopped
         path.unlink()
-    earlier.label_maps()
+    artefacts.label_maps()
     assert [path.read_bytes() for path in maps] == before and len(before) == 10
 
 
@@ -439,7 +439,7 @@ def test_exercise_08_1(streets, metric):
 def test_exercise_08_2(streets):
     runs, shuffled = streets
     widths = tuple(sorted(runs["dilation_width"].dropna().unique()))
-    names = {"section_4_2": section_4_2, "shuffled": shuffled, "pd": pd}
+    names = {"tables": tables, "shuffled": shuffled, "pd": pd}
     means = list(run("08", "53", WIDTHS=widths, **names)["means"].values())
     assert means == sorted(means, reverse=True) and means[0] > -1 and means[-1] < -10
 
@@ -456,7 +456,7 @@ def test_exercise_09_2(build):
     frame = np.zeros((370, 1226), np.uint8)
     drive = tr.Sequence(read_settings().kitti, "00")
     names = {"cv2": cv2, "np": np, "tr": tr, "drive": drive, "frame": frame}
-    names |= {"cityscapes": cityscapes, "earlier": earlier}
+    names |= {"cityscapes": cityscapes, "artefacts": artefacts}
     usual, edited = (run("09", "25 28", CANNY=c, **names)["lost"] for c in ((5, 15), (1, 3)))
     assert edited < usual / 2
 

@@ -8,10 +8,10 @@ import pytest
 from cells import NOTEBOOKS, code_of
 
 from keypoint_study.report import style
-from thesis import audit, captions, gallery
-from thesis.settings import ROOT, read_settings
+from thesis import audit, gallery
+from thesis.run_settings import ROOT, read_settings
 
-ARTEFACTS = [*captions.OF_THESIS, *captions.ADDED]
+ARTEFACTS = [*gallery.OF_THESIS, *gallery.ADDED]
 FIGURES = [artefact for artefact in ARTEFACTS if artefact["kind"] == "figure"]
 TABLE = pd.DataFrame({"sequence": ["00", "01"], "RMSE (m)": [0.5, 12]})
 
@@ -36,7 +36,7 @@ def test_it_has_every_artefact_in_the_order_of_the_thesis(run):
     gallery.update(run)
     text = (run.published / "README.md").read_text()
     titles = re.findall(r"^### (?:\w+ \w+\.\d+\. )?(.+)$", text, re.MULTILINE)
-    assert titles == [artefact["title"] for artefact in ARTEFACTS] and len(captions.THESIS) == 41
+    assert titles == [artefact["title"] for artefact in ARTEFACTS] and len(gallery.THESIS) == 41
     links = re.findall(r"\]\(([^)]+)\)", text)
     assert len(links) > 30 and all((run.published / link).is_file() for link in links)
     assert (run.published / "figure_4_06.svg").read_text() == "drawn"

@@ -11,7 +11,7 @@ from cells import NOTEBOOKS, code_of, named
 from nbconvert import ScriptExporter
 
 from thesis import run
-from thesis.settings import ROOT
+from thesis.run_settings import ROOT
 
 LOOP = "def path_by_hand("  # the one cell that may be longer
 # functions, classes and notebook commands in the listings of each section of the appendix

@@ -8,7 +8,7 @@ from cells import NOTEBOOKS, named
 from trials import PACKAGES, copy_project, finish, start
 
 from thesis import run
-from thesis.settings import ROOT, read_settings
+from thesis.run_settings import ROOT, read_settings
 from thesis_repro.running import provenance
 
 OUTPUT = '"outputs": [{"output_type": "stream", "name": "stdout", "text": ["shown"]}]'
@@ -118,7 +118,7 @@ def test_real_frames_alone_need_no_training(tmp_path):
     assert "04_training" not in rules and "drives" not in rules
 
 
-# In place of python, nbconvert and tools/drives.py: 02 fails.
+# In place of python, nbconvert and tools/render_ahead.py: 02 fails.
 PYTHON = """#!/bin/bash
 name=drives
 for word; do case $word in notebooks/0*) name=${word#notebooks/};; esac; done

@@ -3,7 +3,7 @@ import sys
 import pytest
 from trials import PACKAGES, copy_project, run, snapshot, succeed
 
-from thesis.settings import PROFILES, ROOT, read_settings
+from thesis.run_settings import PROFILES, ROOT, read_settings
 from thesis_repro.errors import InputError
 
 
@@ -68,7 +68,7 @@ def test_folders_begin_at_home_or_in_the_checkout(monkeypatch, tmp_path):
 
 def test_a_copy_for_the_lab_uses_the_results_of_the_checkout(tmp_path):
     copy_project(["notebooks/thesis"], tmp_path)
-    code = "import thesis.settings as s; print(s.__file__, s.read_settings({}).build)"
+    code = "import thesis.run_settings as s; print(s.__file__, s.read_settings({}).build)"
     run = succeed([sys.executable, "-c", code], tmp_path / "notebooks", PYTHONPATH=ROOT)
     used, build = run.stdout.split()
     assert used.startswith(str(tmp_path)) and build == str(ROOT / "build/embedded-demo")
@@ -78,7 +78,7 @@ def test_notebooks_beside_an_installed_package_say_that_they_need_a_checkout(tmp
     copy_project([*PACKAGES, "notebooks"], tmp_path)  # without what only a checkout has
     path = f"{tmp_path}:{tmp_path}/notebooks"
     before = snapshot(tmp_path)
-    failed = run([sys.executable, "-c", "import thesis.settings"], tmp_path, PYTHONPATH=path)
+    failed = run([sys.executable, "-c", "import thesis.run_settings"], tmp_path, PYTHONPATH=path)
     assert failed.returncode == 1 and "InputError" in failed.stderr.splitlines()[-1]
     assert "checkout" in failed.stderr.splitlines()[-1]
     assert {name for name in snapshot(tmp_path) if "__pycache__" not in name.parts} == set(before)

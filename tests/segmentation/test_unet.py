@@ -2,8 +2,8 @@ from inspect import signature
 
 import pytest
 
+from thesis import REPORTED
 from thesis.diagrams import summary_rows
-from thesis.reported import REPORTED
 from thesis_repro import build_unet as public
 from thesis_repro.errors import InputError
 from thesis_repro.segmentation.unet import build_unet

@@ -6,7 +6,7 @@ import pytest
 import tensorflow as tf
 
 import camvid
-from thesis.settings import PROFILES
+from thesis.run_settings import PROFILES
 from thesis_repro.data.cityscapes import N_CLASSES
 from thesis_repro.errors import InputError
 from thesis_repro.segmentation import augmentation, training

@@ -9,7 +9,7 @@ import evidence
 import write_texts
 from keypoint_study import comparisons
 from keypoint_study.report import comparison, style
-from thesis import few_keypoints, section_4_2
+from thesis import few_keypoints, tables
 
 NUMBER = re.compile(r"-?\d+(?:\.\d+)?")
 COMPLETE = "thesis, complete KITTI sequences"
@@ -24,9 +24,9 @@ def of_the_thesis(metric=None):
         comparisons.of_method(runs("runs"), name) for name in ("masked", "baseline")
     )
     if metric is None:
-        return section_4_2.table_4_1(masked, COMPLETE)
+        return tables.table_4_1(masked, COMPLETE)
     shuffled = runs("shuffled_runs")
-    return section_4_2.table_of_change(masked, baseline, shuffled, metric, COMPLETE)
+    return tables.table_of_change(masked, baseline, shuffled, metric, COMPLETE)
 
 
 def all_pairs():

@@ -13,7 +13,7 @@ import evidence
 import train_shipped
 from keypoint_study import jobs, runner
 from keypoint_study.sources import Source
-from thesis.settings import read_settings
+from thesis.run_settings import read_settings
 from thesis_repro.data.sequence import Sequence
 from thesis_repro.segmentation import prediction
 

@@ -13,7 +13,7 @@ import pytest
 from keypoint_study import comparisons
 from keypoint_study.report import style
 from thesis import audit, audit_numbers, map_quality, run
-from thesis.settings import ROOT
+from thesis.run_settings import ROOT
 from thesis_repro.data.cityscapes import ID
 from thesis_repro.running import provenance
 

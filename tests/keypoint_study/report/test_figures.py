@@ -9,7 +9,7 @@ import pytest
 from matplotlib.text import Text
 
 from keypoint_study.report import paths, style
-from thesis import chapter2, chapter3, chapter4, flicker
+from thesis import chapter2, chapter3, chapter4, views
 from thesis_repro.data.cityscapes import ID, LABELS
 
 
@@ -55,7 +55,7 @@ MASK[40:75, 100:130] = 255  # on the car
 ODD = {
     "a kernel of three channels": lambda: chapter2.figure_2_02(*convolution(3)),
     "no keypoints": lambda: chapter4.figure_4_08(
-        flicker.follow_window([FRAME] * 2, [BLANK] * 2, 5), "00"
+        views.follow_window([FRAME] * 2, [BLANK] * 2, 5), "00"
     ),
     "no truth": lambda: paths.figure_of_paths({"$all$": turning()}, None, "sequence 11"),
 }
@@ -87,7 +87,7 @@ def test_the_iou_figure_shows_areas_and_their_ratio():
 
 
 def test_matched_points_of_a_shifted_frame():
-    in_first, in_second, lost, _ = flicker.found_again(FRAME, LATER)
+    in_first, in_second, lost, _ = views.found_again(FRAME, LATER)
     assert len(in_first) > 3 * len(lost)
     assert np.median(in_second - in_first, axis=0) == pytest.approx((5, 0), abs=0.1)
 
@@ -96,7 +96,7 @@ def test_keypoints_jump_with_a_moving_boundary_alone():
     frame = textured(size=(120, 240))
     car = np.where(MASK[:, :240] > 0, ID["car"], ID["road"]).astype(np.uint8)
     still, jumping = (
-        flicker.follow_window([frame, frame], [car, later], 5, first=7)
+        views.follow_window([frame, frame], [car, later], 5, first=7)
         for later in (car, np.roll(car, 14, 1))
     )
     assert [view.frame for view in still] == [7, 8] and still[0].expected is None

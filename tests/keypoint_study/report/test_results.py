@@ -15,8 +15,7 @@ from keypoint_study import comparisons, ratios, verdicts
 from keypoint_study.jobs import ESTIMATOR_TITLES
 from keypoint_study.path_errors import ERRORS
 from keypoint_study.report import comparison, findings, html, style, texts
-from thesis import chapter4, few_keypoints, frames, section_4_2
-from thesis.reported import REPORTED
+from thesis import REPORTED, chapter4, few_keypoints, tables, views
 from thesis_repro.errors import one_line
 
 AHEAD = np.array([[0, 0, z] for z in range(4)])  # true positions, metres
@@ -28,7 +27,7 @@ NEVER_SHUFFLED = made_up.runs(
 
 
 def best_of(runs):
-    return section_4_2.of_chosen_width(comparisons.of_method(runs, "masked"))
+    return tables.of_chosen_width(comparisons.of_method(runs, "masked"))
 
 
 def runs_of(names, errors, widths=(5, 10, 15), **options):
@@ -67,9 +66,9 @@ def test_tables_of_the_thesiss_numbers_equal_the_thesiss(
             else 2 * (1 + reported[name] / 100) + {5: 0.5, 15: 1.0}.get(width, 0)
         ),
     )
-    table = section_4_2.table_of_change(
-        *widths_of(runs), NEVER_SHUFFLED, metric, "thesis"
-    ).set_index("sequence")
+    table = tables.table_of_change(*widths_of(runs), NEVER_SHUFFLED, metric, "thesis").set_index(
+        "sequence"
+    )
     changes = [column for column in table if column.startswith("change")]
     assert len(changes) == 3  # no column for masks that did nothing
     for column in changes:
@@ -78,7 +77,7 @@ def test_tables_of_the_thesiss_numbers_equal_the_thesiss(
             [mean, median], abs=0.05
         )
         assert table.loc["sequences improved", column] == improved
-    widths = section_4_2.table_4_1(widths_of(runs)[0], "thesis")
+    widths = tables.table_4_1(widths_of(runs)[0], "thesis")
     assert set(widths["dilation width (pixels)"]) == {10} and widths["width, thesis"].tolist()[
         :2
     ] == [10, 11]
@@ -88,14 +87,14 @@ def test_failed_runs_are_counted():
     runs = runs_of(ELEVEN, halved)
     failing = (runs["sequence"] == "03") & (runs["method"] == "masked")
     runs.loc[failing & (runs["repetition"] == 0), "failed"] = 5.0
-    table = section_4_2.table_of_change(
-        *widths_of(runs), NEVER_SHUFFLED, "rmse", "thesis"
-    ).set_index("sequence")
+    table = tables.table_of_change(*widths_of(runs), NEVER_SHUFFLED, "rmse", "thesis").set_index(
+        "sequence"
+    )
     assert table.loc["03", "failed runs, best mask"] == "1 of 3"
     for column in ("change (%)", "change (%), one run each"):
         assert table.loc["03", column] < 0 and table.loc["sequences improved", column] == 11
     assert (
-        section_4_2.table_4_1(widths_of(runs)[0], "thesis")
+        tables.table_4_1(widths_of(runs)[0], "thesis")
         .set_index("sequence")
         .loc["03", "failed runs"]
         == "1 of 3"
@@ -181,11 +180,11 @@ def test_ratios_in_the_tables_equal_the_comparison():
     )
     unknown = runs_of(["77"], lambda *_: 1.0)  # a sequence that the thesis does not have
     assert np.isnan(
-        section_4_2.table_of_change(*widths_of(unknown), NEVER_SHUFFLED, "rmse", "thesis").loc[
+        tables.table_of_change(*widths_of(unknown), NEVER_SHUFFLED, "rmse", "thesis").loc[
             0, "change (%), thesis"
         ]
     )
-    assert pd.isna(section_4_2.table_4_1(widths_of(unknown)[0], "thesis").loc[0, "width, thesis"])
+    assert pd.isna(tables.table_4_1(widths_of(unknown)[0], "thesis").loc[0, "width, thesis"])
 
 
 @pytest.mark.parametrize(
@@ -242,8 +241,8 @@ def drawn_by_cells(runs):
     figures = {}
     save = SimpleNamespace(save_figure=lambda figure, name, note: figures.update({name: figure}))
     given = {"runs": runs, "SEQUENCES": sorted(runs["sequence"].unique()), "note": ""}
-    modules = {"np": np, "pd": pd, "chapter4": chapter4, "frames": frames, "style": style}
-    modules |= {"section_4_2": section_4_2, "comparisons": comparisons, "ratios": ratios}
+    modules = {"np": np, "pd": pd, "chapter4": chapter4, "views": views, "style": style}
+    modules |= {"tables": tables, "comparisons": comparisons, "ratios": ratios}
     names = given | modules | {"artefacts": save}
     for number in ("58", "54", "18", "55", "56", "26", "27", "80", "82"):
         exec(cells("08_results.ipynb", "code")[f"08-{number}"], names)

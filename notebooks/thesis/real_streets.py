@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from thesis.settings import ROOT, Settings
+from thesis.run_settings import ROOT, Settings
 from thesis_repro.data import kitti
 from thesis_repro.data.sequence import Sequence
 from thesis_repro.errors import InputError

@@ -1,4 +1,4 @@
-"""What the thesis's own comparison gives (Section 4.2, Tables 4.1 to 4.3).
+"""What the thesis's own comparison gives (Section 4.2, Tables 4.1 to 4.3), and its findings.
 
 The choice of a width is in `keypoint_study.best_width`; all other comparisons are in
 `keypoint_study.comparisons`. A change is Equation 4.1 of means over the repetitions, in percent;
@@ -6,6 +6,8 @@ negative is better. `masked` and `baseline` are the runs with masks of each widt
 keypoints, from `comparisons.of_method`.
 `shuffled` are runs with all keypoints, many repetitions. A metric is "rmse" or "mae".
 """
+
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -20,7 +22,10 @@ from keypoint_study.best_width import (
     stability,
 )
 from keypoint_study.jobs import Job, repeated
-from thesis.reported import REPORTED
+from keypoint_study.report import findings, style, texts
+from thesis import REPORTED, artefacts, map_quality
+from thesis.run_settings import Settings
+from thesis_repro.running.files import write_text
 
 __all__ = [
     "best_widths",
@@ -200,3 +205,42 @@ def _summary_of_studies(studies: pd.DataFrame) -> dict[str, float]:
         f"{of_studies}, from": low,
         f"{of_studies}, to": high,
     }
+
+
+# Notebook 08: notes and findings
+
+
+def notes(settings: Settings, runs: pd.DataFrame, mask_settings: dict[str, Any]) -> tuple[str, str]:
+    """Return what stands at the foot of figures and tables, and how to name the thesis's numbers.
+
+    mask_settings: those that are not the thesis's.
+    """
+    changed = ", ".join(f"{name} {value}" for name, value in mask_settings.items())
+    data = artefacts.data_note()
+    note = f"{data}; masks: {changed}" if changed else data
+    if settings.kitti_is_embedded:
+        return note, "thesis, another data set"
+    frames = runs.groupby("sequence")["frames"].first()
+    lengths = ", ".join(f"{name} ({count} frames)" for name, count in frames.items())
+    return f"{note}; {lengths}", "thesis, complete KITTI sequences"
+
+
+def write_findings(
+    settings: Settings,
+    runs: pd.DataFrame,
+    compared: pd.DataFrame,
+    note: str,
+) -> str:
+    """Write the findings of a run (`findings.findings_of`) beside the figures, and return them.
+
+    compared: `comparisons_of` the runs.
+    """
+    quality = map_quality.label_map_quality(settings.build).round(3)
+    quality = quality.filter(["domain", "images", "classes", "mean_iou", "seen"])
+    more = texts.render(
+        "findings_of_thesis.md.j2",
+        label_maps=[style.markdown(table) for table in (quality,) if len(table)],
+    )
+    text = findings.findings_of(runs, compared, note, settings.kitti_is_embedded, more)
+    write_text(settings.figures / "findings.md", text)
+    return text

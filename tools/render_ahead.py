@@ -5,7 +5,7 @@ The Makefile runs it while notebook 4 trains the network, to save time.
 
 import street_world
 import thesis_repro as tr
-from thesis.settings import read_settings
+from thesis.run_settings import read_settings
 from thesis_repro.running import program
 
 
