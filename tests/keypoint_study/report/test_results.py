@@ -225,8 +225,9 @@ def test_findings_follow_the_verdict(errors, names, verdict, sources):
         assert f"| {texts.short(row)} |" in text
     too_few = verdict == verdicts.TOO_FEW
     assert text.count("too few to compare it with the controls") == too_few * len(sources)
-    beaten = {verdicts.LOWER: 6}.get(verdict, 0)
-    assert text.count(f"lower than with {beaten} of 6 controls") == (not too_few) * len(sources)
+    beaten = {verdicts.LOWER: len(CONTROLS)}.get(verdict, 0)
+    told = f"lower than with {beaten} of {len(CONTROLS)} controls"
+    assert text.count(told) == (not too_few) * len(sources)
 
 
 def test_what_is_far_off_is_told_without_it():
