@@ -8,7 +8,6 @@ A stopped run resumes. The frames of the manifest (`make excerpts`) are written 
 figures/kitti_excerpts, other frames beside it.
 """
 
-import sys
 import time
 from pathlib import Path
 
@@ -254,10 +253,7 @@ def folder_of(settings):
 
 
 def main():
-    """Write the evidence with the settings of the environment. --draw: only draw its tables."""
-    if sys.argv[1:] == ["--draw"]:
-        draw(FOLDER)
-        return
+    """Write the evidence with the settings of the environment."""
     settings = read_settings()
     with provenance.claimed(settings.build / "evidence"):
         folder = folder_of(settings)
