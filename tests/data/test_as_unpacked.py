@@ -217,6 +217,7 @@ def test_another_calibration_leaves_the_body_as_it_is(euroc, tmp_path, caplog):
     trajectories.write_tum(tmp_path / "camera.tum", expected.poses, expected.times)
     sequence = Sequence(None, euroc, truth=tmp_path / "camera.tum")
     np.testing.assert_allclose(sequence.poses, expected.poses, atol=1e-9)
+    assert "camera.tum: poses are the camera's" in caplog.text
     sensor.write_text(without)
     Sequence(None, euroc)
     (line,) = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
