@@ -38,7 +38,7 @@ def test_what_it_is_is_shown(street):
     odometry = tr.Odometry(street.intrinsics)
     for _ in range(2):
         odometry.step(street.frame(0), 1.0)
-    assert "2 frames" in repr(odometry) and "(0.00, 0.00, 0.00)" in repr(odometry)
+    assert "2 frames" in repr(odometry) and "[0. 0. 0.] m" in repr(odometry)
 
 
 @pytest.mark.parametrize(

@@ -40,9 +40,7 @@ def detect(
         mask=mask,
         blockSize=settings.block_size,
     )
-    if points is None:
-        return NO_POINTS
-    return points.reshape(-1, 2)
+    return NO_POINTS if points is None else points.reshape(-1, 2)
 
 
 def track(
@@ -162,11 +160,7 @@ class Odometry:
         self.metres = 0.0  # moved since then
 
     def __repr__(self) -> str:
-        x, y, z = self.pose[:3, 3]
-        return (
-            f"Odometry: {self.count} frames so far, position ({x:.2f}, {y:.2f}, {z:.2f}) m, "
-            f"{len(self.points)} points to track"
-        )
+        return f"Odometry: {self.count} frames so far, position {self.pose[:3, 3].round(2)} m"
 
     def step(self, frame: Any, scale: Any = None, mask: Any = None) -> Step:
         """Take the next frame. Returns a Step.
@@ -203,9 +197,9 @@ class Odometry:
 
     def _estimate(self, step: Step) -> None:
         """Estimate the motion from the matched points, and move the pose (Section 3.7.3)."""
+        threshold = self.settings.threshold
         current = normalise(step.current, self.intrinsics)
         previous = normalise(step.previous, self.intrinsics)
-        threshold = self.settings.threshold
         order = self.settings.order(step.frame, len(current))
         step.matches = Matches(current, previous, threshold, order=order)
         if len(current) < MIN_MATCHES:
@@ -252,8 +246,7 @@ class Odometry:
         if len(points) < self.settings.redetect_below or not len(points):
             with step.timed("detect"):
                 found = self.calls.detect(frame, self.settings, mask)
-            name = f"frame {step.frame}: the detector"
-            detected = inputs.keypoints(found, frame, name)
+            detected = inputs.keypoints(found, frame, f"frame {step.frame}: the detector")
             step.detected = len(detected)
             if len(detected):
                 points = detected
