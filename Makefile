@@ -85,8 +85,8 @@ $(RUN)/notebooks/%.ipynb:
 	  --output-dir $(@D) --output .$* notebooks/$*.ipynb >$(@:.ipynb=.log) 2>&1 & wait $$! \
 	&& mv $(@D)/.$*.ipynb $@ && echo "$*: done in $$SECONDS s" \
 	|| { echo "$* failed: $$($(call reason,$(@:.ipynb=.log))) ($(@:.ipynb=.log))" >&2; exit 1; }
-# The drives of the embedded world, and the shared odometry compiled, while the network is trained.
-$(RUN)/drives:
+# The sequences of the embedded world are rendered, and the shared odometry compiled, while the network is trained.
+$(RUN)/sequences:
 	@nice $(BIN)/python tools/render_ahead.py && touch $@
 # The last line of a log is the error, but not if the kernel died: then it is what the kernel said, or else memory ran out.
 reason = tr -d '\033' <$(1) | sed 's/\[[0-9;]*m//g' | awk '/^F[0-9]|^Fatal Python error|what\(\):/ && !said {said = $$0} NF {last = $$0} \

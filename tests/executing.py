@@ -49,4 +49,4 @@ def execute(folder, world):
         client.execute(env=variables)
         nbformat.write(notebook, run / "notebooks" / name)
         if name == NOTEBOOKS[0]:
-            (run / "drives").touch()  # as if make had rendered the drives
+            (run / "sequences").touch()  # as if make had rendered them

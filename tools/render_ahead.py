@@ -1,4 +1,4 @@
-"""Render the drives of the embedded world, as notebook 5 does, and compile the shared odometry.
+"""Render the sequences of the embedded world, as notebook 5 does, and compile the shared odometry.
 
 The Makefile runs it while notebook 4 trains the network, to save time.
 """
@@ -10,7 +10,7 @@ from thesis_repro.running import program
 
 
 def main() -> None:
-    """Render the drives of the current settings, and run three frames of one with an estimator."""
+    """Render sequences as the settings say, and run three frames of one with an estimator."""
     settings = read_settings()
     street_world.write(
         settings.world,

@@ -22,15 +22,16 @@ from thesis_repro.running import program, provenance
 from thesis_repro.running.files import listed, write_text
 
 RECORDED_NETWORK = "4ac3c7d86e69"  # digest of the one behind the figures in git
-# What make makes, in order, and what each needs. The drives of the embedded world are rendered
-# while notebook 04 trains the network, to save time.
+# the sequences of the embedded world, which are rendered while notebook 04 trains, to save time
+RENDERED = "sequences"
+# what make makes, in order, and what each needs
 NEEDS = {
     "01_load_images_and_labels": [],
-    "drives": ["01_load_images_and_labels"],
+    RENDERED: ["01_load_images_and_labels"],
     "02_augmentation": ["01_load_images_and_labels"],
     "03_unet": [],
     "04_training": ["02_augmentation", "03_unet"],
-    "05_prediction": ["04_training", "drives"],
+    "05_prediction": ["04_training", RENDERED],
     "06_keypoint_masks": ["05_prediction"],
     "07_visual_odometry": ["06_keypoint_masks"],
     "08_results": ["06_keypoint_masks"],
@@ -104,8 +105,8 @@ def check(settings: Settings) -> bool:
 
 
 def wanted(settings: Settings) -> list[str]:
-    """Return what a run makes: with real frames, no drives; without real images, no training."""
-    names = [name for name in NEEDS if settings.kitti_is_embedded or name != "drives"]
+    """Return what a run makes: with real frames, no rendering; with them alone, no training."""
+    names = [name for name in NEEDS if settings.kitti_is_embedded or name != RENDERED]
     if settings.uses_shipped_model:
         names = [name for name in names if name not in OF_TRAINING]
     return names
@@ -118,28 +119,33 @@ def drop_old(settings: Settings, names: list[str]) -> None:
     a digest of its code, the packages, and the data. It is written after the notebook is deleted,
     so nothing old can pass for new. An edited sentence is put into what a notebook made.
     """
-    packages = provenance.digest_of_code(*PACKAGES)
-    data = provenance.digest_of_file(settings.build / "checked")
+    checked = provenance.digest_of_file(settings.build / "checked")
     dropped: set[str] = set()
     for name in names:
         notebook, product = ROOT / f"notebooks/{name}.ipynb", _product(settings.build, name)
-        code = [] if name == "drives" else _code(notebook)
-        read = chain(*(sorted(ROOT.glob(pattern)) for pattern in DATA.get(name, ())))
-        contents = json.dumps([code, packages, data, provenance.digest_of_files(read)])
-        digest = hashlib.sha256(contents.encode()).hexdigest()
+        digest = f"{_digest(name)} {checked}"
         record = settings.build / "code" / name
         is_same = record.is_file() and record.read_text(encoding="utf-8") == digest
         if not is_same or not product.is_file() or dropped & {*NEEDS[name]}:
             dropped.add(name)
             product.unlink(missing_ok=True)
             write_text(record, digest)
-        elif name != "drives":
+        elif name != RENDERED:
             _put_sentences(notebook, product)
 
 
 def _product(build: Path, name: str) -> Path:
     """Return the file that tells make that something is made."""
-    return build / "drives" if name == "drives" else build / f"notebooks/{name}.ipynb"
+    return build / name if name == RENDERED else build / f"notebooks/{name}.ipynb"
+
+
+def _digest(name: str) -> str:
+    """Return a digest of a notebook's code, of the packages, and of the project's data for it."""
+    code = [] if name == RENDERED else _code(ROOT / f"notebooks/{name}.ipynb")
+    read = chain(*(sorted(ROOT.glob(pattern)) for pattern in DATA.get(name, ())))
+    packages = provenance.digest_of_code(*PACKAGES)
+    contents = json.dumps([code, packages, provenance.digest_of_files(read)])
+    return hashlib.sha256(contents.encode()).hexdigest()
 
 
 def _code(notebook: Path) -> list[str] | str:

@@ -45,7 +45,7 @@ def again(settings):
 
 def make(settings):
     """Stand in for make: write what is missing."""
-    (settings.build / "drives").touch()
+    (settings.build / "sequences").touch()
     for name in NOTEBOOKS:
         executed = settings.build / "notebooks" / name
         if not executed.exists():
@@ -104,7 +104,7 @@ def test_what_needs_a_missing_notebook_is_executed_again(settings):
     (settings.build / "notebooks" / named("06")).unlink()
     assert again(settings) == ["06", "07", "08", "09"]
     make(settings)
-    (settings.build / "drives").unlink()  # 05 takes them
+    (settings.build / "sequences").unlink()  # 05 takes them
     assert again(settings) == ["05", "06", "07", "08", "09"]
     make(settings)
     (settings.build / "checked").write_text("other data")
@@ -115,15 +115,15 @@ def test_real_frames_alone_need_no_training(tmp_path):
     settings = read_settings({"THESIS_REPRO_KITTI": str(tmp_path)})
     assert " ".join(name[:2] for name in run.wanted(settings)) == "03 05 06 07 08 09"
     rules = run.rules(run.wanted(settings))
-    assert "04_training" not in rules and "drives" not in rules
+    assert "04_training" not in rules and "sequences" not in rules
 
 
 # In place of python, nbconvert and tools/render_ahead.py: 02 fails.
 PYTHON = """#!/bin/bash
-name=drives
+name=sequences
 for word; do case $word in notebooks/0*) name=${word#notebooks/};; esac; done
 echo $name >>order
-case $name in 02*) test -e works || exit 1;; drives) exit 0;; esac
+case $name in 02*) test -e works || exit 1;; sequences) exit 0;; esac
 : >run/notebooks/.$name
 """
 
@@ -145,7 +145,7 @@ def test_make_executes_what_is_missing_in_order(tmp_path):
         executed.append([line.partition("_")[0] for line in lines])
         (tmp_path / "works").touch()
         os.utime(tmp_path / "run/notebooks" / NOTEBOOKS[0])  # the first one becomes the newest
-    assert sorted(executed[0]) == ["01", "02", "03", "drives"]
+    assert sorted(executed[0]) == ["01", "02", "03", "sequences"]
     first, *later = executed[1]
     assert (first, later[0], later[1], set(later[2:4]), later[-1]) == (
         "02",

@@ -83,7 +83,9 @@ class Sequence:
                 poses = _poses_of_camera(poses, poses_path, body, body_path)
                 texts.append(body_path)
             elif lens.body is not None:
-                say_once(f"{poses_path}: poses are the camera's; those of the body need EuRoC's .csv")
+                say_once(
+                    f"{poses_path}: poses are the camera's; those of the body need EuRoC's .csv"
+                )
             if indices is None:
                 check_count(poses_path, len(poses), files.frames)
             else:
