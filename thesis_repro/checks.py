@@ -167,7 +167,8 @@ def run_warnings(
 def inverted_truth(sequence: Sequence, estimated: np.ndarray) -> list[str]:
     """Warn if the true poses fit an estimated path, (n, 4, 4), better when they are inverted.
 
-    Only directions of steps are compared, in the median, of paths that have enough of them.
+    Only directions of steps are compared, in the median, of paths that have enough of them. On a
+    straight street, poses with OpenGL's axes or in reverse order fit better inverted, too.
     """
     from thesis_repro.odometry.metrics import step_errors  # takes 0.4 s to load
 
@@ -176,8 +177,8 @@ def inverted_truth(sequence: Sequence, estimated: np.ndarray) -> list[str]:
     if inverted["steps"] < MIN_STEPS or not inverted["direction"] < FITS < given["direction"]:
         return []
     return [
-        f"{sequence.poses_path}: the truth fits better inverted; true poses must be camera to world, "
-        "np.linalg.inv makes them of world to camera"
+        f"{sequence.poses_path}: the truth fits better inverted; true poses must be camera to world, with "
+        "the axes x right, y down, z forward"
     ]
 
 
