@@ -1,24 +1,21 @@
 """The commands and Python examples of the README and of docs run."""
 
-import itertools
 import pydoc
 import re
 import shlex
 import textwrap
 import warnings
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from street import Street
 
 import thesis_repro as tr
 from thesis.run_settings import ROOT
 from thesis_repro.command import cli
 from thesis_repro.command.options import build_parser
 from thesis_repro.data.cameras import read_camera
-from thesis_repro.data.trajectories import read_poses, read_poses_at
+from thesis_repro.data.trajectories import read_poses
 from thesis_repro.masks import KINDS
 from thesis_repro.odometry.estimators import ESTIMATORS
 
@@ -30,7 +27,7 @@ def blocks(path, language):
 
 
 @pytest.mark.parametrize(
-    "text, names", [("own-masks", [*KINDS][1:]), ("reading-results", ESTIMATORS)]
+    "text, names", [("own-data", [*KINDS][1:]), ("reading-results", ESTIMATORS)]
 )
 def test_each_kind_of_mask_and_each_estimator_is_explained(text, names):
     words = (ROOT / f"docs/{text}.md").read_text(encoding="utf-8")
@@ -54,7 +51,7 @@ def test_the_example_of_the_readme_compares_three_paths(small_world, tmp_path, m
     (tmp_path / "labels").symlink_to(small_world / "kitti/sequences/00/labels_0")
     names = {}
     exec(example, names)
-    paths = names["baseline"], names["masked"], names["few"]
+    paths = names["plain"], names["masked"], names["few"]
     assert [len(path.poses) for path in paths] == [12, 12, 12]
     every, masked, few = [path.frames["detected"].mean() for path in paths]
     assert few == 200 and 200 < masked < every
@@ -77,16 +74,6 @@ def test_help_begins_with_an_example_that_runs(small_world, tmp_path, monkeypatc
     assert names["result"].frames["detected"].mean() == 200  # the last one, spread
 
 
-class Camera:
-    """A camera that drives past walls of noise and never stops."""
-
-    def __init__(self):
-        self.frames = itertools.cycle(Street(12).images)
-
-    def read(self):
-        return True, cv2.cvtColor(next(self.frames), cv2.COLOR_GRAY2BGR)
-
-
 @pytest.fixture
 def examples(small_world, tmp_path, monkeypatch):
     """The Python recipes for what people bring, run beside a world and its frames and video."""
@@ -99,63 +86,30 @@ def examples(small_world, tmp_path, monkeypatch):
     for image in images:
         video.write(image)
     video.release()
-    answers = iter([-1] * 8 + [ord("q")])  # of the keyboard, once a frame of the live camera
-    monkeypatch.setattr(cv2, "waitKey", lambda _: next(answers), raising=False)
-    monkeypatch.setattr(cv2, "imshow", lambda *_: None, raising=False)
-    stored = cv2.VideoCapture
-    monkeypatch.setattr(cv2, "VideoCapture", lambda name: Camera() if name == 0 else stored(name))
     results = []
-    for example in blocks(ROOT / "docs/own-masks.md", "python"):
-        names = {"lines": len(example.splitlines())}
+    for example in blocks(ROOT / "docs/own-data.md", "python"):
+        names = {}
         exec(example, names)
         results.append(names)
     return images, results
 
 
-def test_the_recipes_for_what_people_bring_run(examples, tmp_path):
-    images, (memory, network, whole, kept, live, step, detectors, own, video, _) = examples
-    short = memory, whole, kept, live, step, detectors, video
-    assert max(recipe["lines"] for recipe in short) <= 15
-
-    drive, result = memory["drive"], memory["result"]
-    assert len(drive) == len(images) == len(result.poses)
-    np.testing.assert_allclose(drive.scales[1:], 8.3 / 25)
+def test_the_recipes_for_what_people_bring_run(examples):
+    images, (memory, network, own, _) = examples
+    sequence, result = memory["sequence"], memory["result"]
+    assert len(sequence) == len(images) == len(result.poses)
+    np.testing.assert_allclose(sequence.scales[1:], 8.3 / 25)
     assert 3 < np.linalg.norm(result.poses[-1, :3, 3]) < 3.7  # eleven steps
+    assert np.array_equal(read_poses("path.txt"), result.poses)
 
     last, mask = network["step"], network["mask_of"](images[-1][..., 0])
     u, v = last.keypoints.astype(int).T
     assert len(u) > 100 and mask[v, u].all()
     assert 10 < np.linalg.norm(last.pose[:3, 3]) < 11.1  # eleven steps of a metre
 
-    runs, drive = whole["runs"], whole["drive"]
-    masks = [whole["mask_of"](index, frame) for index, frame in enumerate(drive)]
-    expected = tr.run(drive, masks=masks).poses
-    assert runs.keys() == {"all", "masked"} and np.array_equal(whole["result"].poses, expected)
-
-    result = kept["result"]
-    assert np.array_equal(read_poses("path.txt"), result.poses) and len(result.poses) == 6
-    indices, poses = read_poses_at(Path("path.tum"), kept["drive"].times)
-    assert list(indices) == list(range(6))
-    np.testing.assert_allclose(poses, result.poses, atol=1e-9)
-
-    drawing, steps = cv2.imread("live.png"), live["odometry"].count
-    assert steps == 8 and 15 < (drawing == (0, 0, 255)).all(axis=2).sum() < 9 * steps
-    assert live["step"].flags == [] and 3.4 < live["step"].pose[2, 3] < 3.6  # seven steps
-
-    picture = cv2.imread("step.png")
-    red, green = ((picture == colour).all(axis=2).sum() for colour in ((0, 0, 255), (0, 255, 0)))
-    assert step["step"].frame == 7 and min(green, red) > 0
-    assert cv2.imread("paths.png") is not None and len(detectors["runs"]) == 3
-
     counts = own["result"].frames["detected"]
     plain = own["detect"](images[0][..., 0], None, None)
     assert counts[0] == len(plain) and own["result"].frames["updated"][1:].all()
-
-    first = cv2.imread("my-drive/000001.png", cv2.IMREAD_UNCHANGED)
-    assert len(list((tmp_path / "my-drive").glob("*.png"))) == len(images)
-    times = np.loadtxt(tmp_path / "my-drive/times.txt")
-    np.testing.assert_allclose(times, np.arange(len(images)) / 25)
-    assert first.ndim == 2 and first.dtype == np.uint8
 
     camera = read_camera("sensor.yaml")
     assert camera.matrix[0, 0] == 458.7 and camera.distortion[3] == 0.00002
@@ -163,7 +117,7 @@ def test_the_recipes_for_what_people_bring_run(examples, tmp_path):
 
 
 def test_points_that_leave_the_frame_are_not_found_by_the_recipe_for_own_matches(examples):
-    images, (*_, own, _, _) = examples
+    images, (*_, own, _) = examples
     frames = [image[..., 0] for image in images[:2]]
     height, width = frames[0].shape
     ends = [[-3, 9], [width, 9], [9, -3], [9, height], [0, 0], [width - 1, height - 1]]
@@ -175,7 +129,7 @@ def test_points_that_leave_the_frame_are_not_found_by_the_recipe_for_own_matches
 @pytest.mark.slow
 @pytest.mark.parametrize("sequence", ["00", "05"])
 def test_the_recipe_for_own_matches_runs_on_a_whole_street(sequence, kitti_real):
-    (recipe,) = (text for text in blocks(ROOT / "docs/own-masks.md", "python") if "DIS" in text)
+    (recipe,) = (text for text in blocks(ROOT / "docs/own-data.md", "python") if "DIS" in text)
     names = {}
     exec(recipe.replace('"world/kitti", 0', f"{str(kitti_real)!r}, {sequence!r}"), names)
     poses = names["result"].poses

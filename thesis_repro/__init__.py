@@ -16,7 +16,7 @@ A few lines of use::
 
 Detectors: spread, filled, filtered, orb; without one, Shi-Tomasi as in the thesis. Odometry takes
 one frame at a time. keypoint_mask makes a mask from a label map. InputError says what to do.
-Names are imported on first use, TensorFlow when build_unet is called. Recipes: docs/own-masks.md.
+Names are imported on first use, TensorFlow when build_unet is called. Recipes: docs/own-data.md.
 """
 
 from importlib.metadata import version

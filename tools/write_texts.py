@@ -197,6 +197,20 @@ def commands() -> dict[str, Any]:
     return dict(action.choices or {})
 
 
+def rows_of_options() -> dict[str, list[str]]:
+    """Return a row of a table for each option, with the names of the commands that have it."""
+    rows: dict[str, list[str]] = {}
+    for name, command in commands().items():
+        for option in command._actions[1:]:
+            shown = " ".join(option.option_strings)
+            if option.nargs != 0:
+                value = option.metavar or "|".join(option.choices)
+                shown = f"{shown} {value}".strip().replace("|", "\\|")
+            row = f"| `{shown}` | {option.help.replace('%%', '%')} |"
+            rows.setdefault(row, []).append(name)
+    return rows
+
+
 def whole(number: float) -> str:
     """Return a number without decimals."""
     return f"{number:.0f}"
@@ -229,6 +243,7 @@ def book() -> str:
 FUNCTIONS = (
     read_table,
     commands,
+    rows_of_options,
     error,
     verdict,
     of_controls,

@@ -434,7 +434,7 @@ def test_what_the_camera_did_not_see_has_no_keypoints(own):
         ("--tum ./path.txt --output path.txt", "--output, --tum: both are"),
         ("--speed -3", "speed -3: must be"),
         ("--speed 0", "speed 0: must be"),
-        ("--sequence drive.mp4", "drive.mp4: is a file; .*own-masks.md"),
+        ("--sequence drive.mp4", "drive.mp4: is a file; .*own-data.md"),
     ],
 )
 def test_names_and_numbers_that_cannot_be_are_one_line(own, options, said, monkeypatch, capsys):

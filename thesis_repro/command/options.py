@@ -199,7 +199,7 @@ def _source(kind: str, form: str, content: str) -> dict[str, Any]:
         action="append",
         metavar=form,
         type=lambda text: (kind, *_name_and_folder(text)),
-        help=f"{content}, and a name for it (the folder's); can be repeated",
+        help=f"{content} (NAME: the folder's; can be repeated)",
     )
 
 
@@ -259,7 +259,7 @@ COMMANDS: dict[str, dict[str, Any]] = {
         "--preprocess": dict(
             choices=["tf", "torch", "caffe"],
             help="instead of --scale, what Keras' applications want: tf for -1 to 1; torch and caffe take out "
-            "the mean colour of ImageNet (gray values from 0 to 255)",
+            "ImageNet's mean colour",
         ),
     },
     "masks": {
@@ -288,8 +288,7 @@ COMMANDS: dict[str, dict[str, Any]] = {
             type=float,
             metavar="SECONDS",
             default=0.01,
-            help="a frame gets the true pose that is nearest in time, at most so far; frames without one are left "
-            "out (0.01, as in evo)",
+            help="how far the true pose of a frame may be in time; frames without one are left out (0.01, as in evo)",
         ),
         "--speed": dict(
             type=float,
@@ -355,7 +354,7 @@ COMMANDS: dict[str, dict[str, Any]] = {
         "--keypoints": _source(
             "keypoints",
             "[NAME=]FILE.py",
-            "Python file, which is executed, with your function detect(frame, settings, mask), "
+            "Python file, which is executed, with your detect(frame, settings, mask), "
             "track(previous, current, points, settings), or others of the odometry's four calls",
         ),
         "--widths": dict(

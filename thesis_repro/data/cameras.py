@@ -79,7 +79,7 @@ def read_camera(path: str | Path, name: str = "") -> Camera:
     if not is_camera:
         raise InputError(
             f"{path}: must hold fx fy cx cy k1 k2 p1 p2 or only the first four, or be YAML of OpenCV, ROS, "
-            "EuRoC or Kalibr; docs/own-masks.md writes it for other cameras"
+            "EuRoC or Kalibr; docs/own-data.md writes it for other cameras"
         )
     return camera
 

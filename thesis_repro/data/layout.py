@@ -23,8 +23,7 @@ def files(folder: Path, camera: str | None = None) -> Files:
     """
     if folder.is_file():
         raise InputError(
-            f"{folder}: is a file; a sequence is a folder of frames (docs/own-masks.md says how to write "
-            "those of a video)"
+            f"{folder}: is a file; a sequence is a folder of frames (docs/own-data.md reads a video)"
         )
     return layout_of(folder).files(folder, camera)
 

@@ -30,7 +30,7 @@ def orb(
 
 @dataclass(frozen=True)
 class spread:  # it is called like a function
-    """The `number` strongest keypoints that are as far apart as their number allows.
+    """N of the strongest keypoints, as far apart as their number allows.
 
     The field calls it adaptive non-maximal suppression. The distance, whole pixels, is found by
     bisection in each frame: the largest one that leaves `number`.
