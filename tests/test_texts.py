@@ -19,8 +19,8 @@ from thesis_repro.odometry import metrics
     [
         ("README.md.j2", 900),
         ("answer.md.j2", 1200),
-        ("reading-results.md.j2", 2600),
-        ("options.md.j2", 1800),
+        ("reading-results.md.j2", 1200),
+        ("options.md.j2", 1200),
     ],
 )
 def test_texts_in_git_are_those_of_the_tables_and_short(template, words):
