@@ -5,6 +5,7 @@ import os
 import sys
 from contextlib import redirect_stdout, suppress
 from dataclasses import replace
+from itertools import combinations
 from math import isnan
 from pathlib import Path
 from typing import Any
@@ -70,9 +71,14 @@ def predict(options: Any) -> None:
         output = options.folder
         if folder != options.images:  # one of several sequences
             output /= folder.name
-        paths, how = paths[: options.frames], {"scale": options.scale, "lens": lens}
+        paths = paths[: options.frames]
         new = prediction.write_label_maps(
-            model, paths, output, preprocess=options.preprocess, **how
+            model,
+            paths,
+            output,
+            scale=options.scale,
+            lens=lens,
+            preprocess=options.preprocess,
         )
         reused += len(paths) - new
         lines.append(f"{output}: {len(paths)} label maps")
@@ -375,11 +381,9 @@ def _check_outputs(options: Any, *inputs: Path | None) -> None:
         endings = OUTPUT_FILES[name][1]
         if endings and path.suffix.lower() not in endings:
             raise InputError(f"--{name} {path}: its name must end in {' or '.join(endings)}")
-        for other in list(outputs)[: list(outputs).index(name)]:
-            if path.resolve() == outputs[other].resolve():
-                raise InputError(
-                    f"--{other}, --{name}: both are {path}; give each a name of its own"
-                )
+    for (one, path), (other, same) in combinations(outputs.items(), 2):
+        if path.resolve() == same.resolve():
+            raise InputError(f"--{one}, --{other}: both are {same}; give each a name of its own")
     for path in filter(None, [vars(options).get("folder"), *outputs.values()]):
         for folder in data:
             if path.resolve().is_relative_to(folder):
