@@ -60,19 +60,3 @@ def test_savings_are_equation_4_2_for_each_number_of_threads():
     seconds = pd.DataFrame(rows, columns=["method", "dilation_width", "threads", "seconds"])
     savings = timing.time_savings(seconds)
     assert savings.loc[5].to_dict() == {"1 thread": -20, "2 threads": 25}
-
-
-def test_each_single_sequence_of_figure_4_17_has_its_name():
-    rows = [
-        (name, method, width, threads, 10 + 3 * number - width)
-        for number, name in enumerate(("00", "07", "drive0005"))
-        for method, width in (("baseline", 0), ("masked", 1), ("masked", 2))
-        for threads in (1, 2)
-    ]
-    columns = ["sequence", "method", "dilation_width", "threads", "seconds"]
-    figure = timing.figure_4_17(pd.DataFrame(rows, columns=columns), embedded=True)
-    (axes,) = figure.axes
-    assert {text.get_text() for text in axes.texts} == {"00", "07", "drive0005"}
-    heights = sorted(text.xyann[1] for text in axes.texts)
-    low, high = axes.get_ylim()
-    assert min(b - a for a, b in zip(heights, heights[1:])) > (high - low) / 25
