@@ -17,7 +17,8 @@ from numba.core import event as numba_events
 import street_world
 from keypoint_study.jobs import CONTROL_WIDTH
 from keypoint_study.report import style
-from thesis.run_settings import ROOT, Settings, read_settings
+from thesis import real_streets
+from thesis.run_settings import Settings, read_settings
 from thesis_repro.data import cityscapes, kitti
 from thesis_repro.data.sequence import Sequence
 from thesis_repro.errors import InputError
@@ -176,9 +177,6 @@ def with_sliders(draw: Callable[..., plt.Figure], **sliders: Any) -> None:
 # What a lesson that is opened first makes: rendered sequences and label maps. What is there stays.
 
 
-EVIDENCE = ROOT / "figures/kitti_excerpts"
-
-
 def drives() -> list[Sequence]:
     """Return the sequences of the run. Those of the embedded world are rendered if need be."""
     settings = read_settings()
@@ -242,11 +240,11 @@ def results() -> tuple[pd.DataFrame, pd.DataFrame, str]:
     Without notebook 8 they are those of the real streets in git.
     """
     build = read_settings().build
-    folder, whose = EVIDENCE, "the real streets in git, because notebook 8 was not run"
+    folder, whose = real_streets.FOLDER, "the real streets in git, because notebook 8 was not run"
     if (build / "shuffled_runs.csv").is_file():
         folder, whose = build, "this run"
-    tables = [
+    runs, shuffled = (
         pd.read_csv(folder / name, dtype={"sequence": str}, low_memory=False)
         for name in ("runs.csv", "shuffled_runs.csv")
-    ]
-    return tables[0], tables[1], whose
+    )
+    return runs, shuffled, whose

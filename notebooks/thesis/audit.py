@@ -144,20 +144,18 @@ def side_by_side(tables: dict[str, pd.DataFrame]) -> pd.DataFrame:
     lines = pd.concat([table.assign(column=name) for name, table in tables.items()])
     lines["column"] = lines["column"].mask(lines["data"] == ARITHMETIC, ARITHMETIC)
     lines["number"] = [*map(_number, lines["value"], lines["low"], lines["high"])]
-    numbers = {
-        tuple(line[:-1]): line[-1] for line in lines[[*NAMED, "column", "number"]].to_numpy()
-    }
-    shown = lines[NAMED].drop_duplicates()
-    has_numbers = set(shown.loc[shown["quantity"] != "", "row"])
-    shown = shown[(shown["quantity"] != "") | ~shown["row"].isin(has_numbers)]
+    is_measured = lines["quantity"] != ""
+    # a row without numbers has one line, unless another audit has numbers for it
+    has_numbers = lines["row"].isin(lines.loc[is_measured, "row"])
+    shown = lines.loc[is_measured | ~has_numbers, NAMED].drop_duplicates()
     shown = shown.sort_values("row", key=lambda row: row.astype(int), kind="stable")
     for column in (ARITHMETIC, *tables):
-        shown[column] = [numbers.get((*line, column), "") for line in shown[NAMED].to_numpy()]
-    words = lines.drop_duplicates("row").set_index("row")[WORDS].loc[shown["row"]]
-    words[shown["row"].duplicated().to_numpy()] = ""
-    return pd.concat(
-        [words.reset_index(), shown.drop(columns="row").reset_index(drop=True)], axis=1
-    )
+        numbers = lines.loc[lines["column"] == column, [*NAMED, "number"]].drop_duplicates()
+        shown = shown.merge(numbers.rename(columns={"number": column}), how="left", on=NAMED)
+    words = lines.drop_duplicates("row")[["row", *WORDS]]
+    table = words.merge(shown.fillna(""), on="row", how="right")
+    table.loc[table["row"].duplicated(), WORDS] = ""
+    return table
 
 
 def _read(folder: Path) -> pd.DataFrame:

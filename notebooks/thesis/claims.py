@@ -305,10 +305,9 @@ def _as_well(at_hand: Tables) -> Claim:
     refined = pd.DataFrame(
         {error: at_hand.over("masked", error, "refined") for error in comparisons.JUDGING_METRICS}
     )
-    equal, places = (
-        equal_number.over(*_few(at_hand.few, (choice, 200), ("random", 200)))
-        for choice in ("mask", "random-on")
-    )
+    at_random = ("random", 200)
+    equal = equal_number.over(*_few(at_hand.few, ("mask", 200), at_random))
+    places = equal_number.over(*_few(at_hand.few, ("random-on", 200), at_random))
     return Claim(
         "as well",
         "4, 4.2, 5.1",

@@ -119,17 +119,9 @@ def figure_2_05(
         xlabel="probability",
     )
     axes[1].set_yticks(right, ["class 1", "class 2", "class 3"])
-    figure.legend(
-        handles=[
-            Line2D([], [], color=color, label=text)
-            for color, text in (
-                (style.BLUE, "weight above 0 (the wider, the larger)"),
-                (style.RED, "weight below 0"),
-            )
-        ],
-        loc="outside lower center",
-        ncols=2,
-    )
+    above = Line2D([], [], color=style.BLUE, label="weight above 0 (the wider, the larger)")
+    below = Line2D([], [], color=style.RED, label="weight below 0")
+    figure.legend(handles=[above, below], loc="outside lower center", ncols=2)
     return figure
 
 
@@ -161,12 +153,11 @@ def figure_a_01(model: Any, rows: list[dict[str, Any]]) -> plt.Figure:
     """Figure A.1: the summary of a Keras model, as a table. rows: `summary_rows`."""
     trainable = sum(weights.numpy().size for weights in model.trainable_weights)
     total = model.count_params()
-    lines = [
-        ("Layer (type)", "Output shape", "Parameters", "Connected to"),
-        *(
-            (row["layer"], row["output_shape"], f"{row['params']:,}", row["connected_to"])
-            for row in rows
-        ),
+    lines = [("Layer (type)", "Output shape", "Parameters", "Connected to")]
+    for row in rows:
+        count = f"{row['params']:,}"
+        lines.append((row["layer"], row["output_shape"], count, row["connected_to"]))
+    lines += [
         ("", "", "", ""),
         ("Parameters, total", "", f"{total:,}", ""),
         ("trainable", "", f"{trainable:,}", ""),

@@ -10,6 +10,7 @@ and here (for this run's numbers).
 import json
 import shutil
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -31,15 +32,23 @@ _OF_STUDIES = {
     ("table", "widths"): OF_STUDIES["widths"],
     ("text", "findings"): ("What the runs show", ""),
 }
-# artefacts that are not in the thesis
-ADDED = [
-    dict(zip(("title", "caption"), _OF_STUDIES.get((artefact["kind"], artefact["name"]), ())))
-    | artefact
-    for artefact in _CAPTIONS["added"]
-]
+
+
+def _added() -> list[dict[str, Any]]:
+    """Return the artefacts that are not in the thesis. Those of studies have the study's words."""
+    added = []
+    for artefact in _CAPTIONS["added"]:
+        words = _OF_STUDIES.get((artefact["kind"], artefact["name"]))
+        if words:
+            artefact = {"title": words[0], "caption": words[1]} | artefact
+        added.append(artefact)
+    return added
+
+
+ADDED = _added()
 # what is to be seen, {name of a figure, or id of a notebook's cell: alternative text}
 SEEN = _CAPTIONS["seen"]
-OF_THESIS = [artefact for artefacts in CHAPTERS.values() for artefact in artefacts]
+OF_THESIS = [*chain(*CHAPTERS.values())]
 THESIS = [artefact["name"] for artefact in OF_THESIS]
 CONSTANT = [artefact["name"] for artefact in OF_THESIS if artefact.get("constant")]
 REAL = "kitti_excerpts"  # folder of the evidence on real frames (tools/evidence.py)
@@ -105,11 +114,9 @@ def text(settings: Settings) -> str:
 
 def _of_real_frames(settings: Settings) -> list[dict[str, Any]]:
     """Return the described artefacts of the evidence on real frames that is in git."""
-    few, others = (
-        [artefact for artefact in ADDED if artefact["name"] in names]
-        for names in (["few_keypoints"], ["comparison", "widths"])
-    )
-    chapter = [*CHAPTERS["Chapter 4: results"], *few, *others]
+    chapter = [*CHAPTERS["Chapter 4: results"]]
+    for names in (["few_keypoints"], ["comparison", "widths"]):
+        chapter += [artefact for artefact in ADDED if artefact["name"] in names]
     real = replace(settings, kitti_is_embedded=False)
     described = _described(chapter, real, settings.published / REAL)
     for artefact in described:
@@ -149,7 +156,7 @@ def _beside(
 ) -> dict[str, Any]:
     """Return what the thesis reports beside an artefact and what this run gives, as texts.
 
-    thesis: the templates, see `captions`. numbers: of this run, or None if it has none.
+    thesis: the templates, see above. numbers: of this run, or None if it has none.
     """
     fill = texts.TEMPLATES.from_string
     embedded = {"runs": settings.kitti_is_embedded, "training": settings.cityscapes_is_embedded}

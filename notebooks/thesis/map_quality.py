@@ -88,10 +88,9 @@ def table_of_scores(scores: pd.DataFrame) -> pd.DataFrame:
 
     scores: of `scores_of_models`. A cell is empty if the class is absent.
     """
-    measures = {
-        name: (factor * scores[column]).round(digits)
-        for column, (name, factor, digits) in MEASURES.items()
-    }
+    measures = {}
+    for column, (name, factor, digits) in MEASURES.items():
+        measures[name] = (factor * scores[column]).round(digits)
     ious = scores.filter([IOU.format(label.name) for label in cityscapes.LABELS]).round(3)
     rows = pd.DataFrame(measures).join(ious).set_axis(scores["model"] + ": " + scores["domain"]).T
     return rows.rename_axis(index="measure", columns=None).reset_index()
