@@ -111,6 +111,24 @@ def test_digests_change_with_the_bytes_and_the_names(tmp_path):
     assert len({first, second, provenance.digest_of_files(paths)}) == 3
 
 
+@pytest.mark.parametrize(
+    "path, changes", [("a/in/one.py", True), ("b.py", True), ("c.py", False), ("a/data.csv", False)]
+)
+def test_the_digest_of_code_changes_with_any_module_of_its_folders(
+    tmp_path, monkeypatch, path, changes
+):
+    monkeypatch.setattr(provenance, "ROOT", tmp_path)
+    for name in ("a/in/one.py", "b.py"):
+        files.write_text(tmp_path / name, "ONE = 1")
+    digests = []
+    for text in ("ONE = 1", "ONE = 1  # a comment"):
+        files.write_text(tmp_path / path, text)
+        provenance.digest_of_code.cache_clear()
+        digests.append(provenance.digest_of_code("a", "b.py"))
+    provenance.digest_of_code.cache_clear()
+    assert (digests[0] != digests[1]) == changes
+
+
 def test_a_package_that_another_distribution_brings_has_a_version(monkeypatch):
     """As tensorflow-cpu brings tensorflow."""
 
