@@ -17,7 +17,7 @@ import pandas as pd
 from keypoint_study import comparisons, jobs, ratios, runner
 from keypoint_study.report import style, texts
 from keypoint_study.sources import Source
-from thesis import chapter4, few_keypoints, real_streets, tables, timing
+from thesis import chapter4, few_keypoints, real_frames, tables, timing
 from thesis.run_settings import read_settings
 from thesis_repro.data import kitti
 from thesis_repro.data.sequence import Sequence
@@ -26,7 +26,7 @@ from thesis_repro.odometry import metrics
 from thesis_repro.running import program, provenance
 from thesis_repro.running.files import needed, write_text
 
-FOLDER = real_streets.FOLDER
+FOLDER = real_frames.FOLDER
 # Figures and tables of notebooks 8 and 9. Other notebooks draw frames, which are not ours to give.
 KEPT = (
     *(f"figure_4_{number:02d}" for number in (6, 7, 9, 10, 11, 12, 17)),
@@ -174,7 +174,7 @@ def runs_of_every_second(settings, sequences, labels):
     """Run masks and few spread keypoints with every second frame: KITTI at 5 frames a second."""
     folder = settings.build / "every_second"
     thinned = [
-        real_streets.cut(each, 0, len(each) - 1, folder / "frames", each.name, every=2)
+        real_frames.cut(each, 0, len(each) - 1, folder / "frames", each.name, every=2)
         for each in sequences
     ]
     return few_keypoints.run_few(
@@ -244,7 +244,7 @@ def _streets(sequences):
 
 def folder_of(settings):
     """Return the folder of the evidence: the one in git for its own frames alone, at its sizes."""
-    if real_streets.is_evidence(settings):
+    if real_frames.is_evidence(settings):
         return FOLDER
     program.log.info(
         "evidence: these are not the frames and sizes of the evidence in git, which stays as it is"

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from thesis import real_streets
+from thesis import real_frames
 from thesis.run_settings import ROOT
 from thesis_repro.data.sequence import Sequence
 from thesis_repro.errors import InputError
@@ -36,15 +36,15 @@ def opened(street: pd.Series, kitti_root: str, raw_root: str) -> Sequence:
 def cut_streets(kitti_root: str, raw_root: str, folder: Path) -> dict[str, str]:
     """Cut all streets of the manifest, and return what differs or is missing, by street."""
     told = {}
-    manifest = real_streets.read_manifest()
+    manifest = real_frames.read_manifest()
     for name, street in progress(list(manifest.iterrows()), "cutting", unit="street"):
         try:
             sequence = opened(street, kitti_root, raw_root)
-            made = real_streets.cut(sequence, street["first"], street["last"], folder, name)
+            made = real_frames.cut(sequence, street["first"], street["last"], folder, name)
         except InputError as error:
             told[name] = f"missing: {error}"
             continue
-        parts = real_streets.differences(made, street)
+        parts = real_frames.differences(made, street)
         if parts:
             told[name] = f"other {' and '.join(parts)} than the evidence's ({street['made']})"
     return told
@@ -56,7 +56,7 @@ def main(arguments: list[str]) -> int:
     told = cut_streets(kitti_root, raw_root, FOLDER)
     for name, text in told.items():
         program.log.warning(f"{name}: {text}")
-    count = len(real_streets.read_manifest())
+    count = len(real_frames.read_manifest())
     program.summary(f"{count - len(told)} of {count} streets are those of the evidence: {FOLDER}")
     return int(bool(told))
 

@@ -11,7 +11,7 @@ import numpy as np
 
 import thesis_repro as tr
 from keypoint_study.report import style
-from thesis import real_streets, views
+from thesis import real_frames, views
 from thesis.run_settings import ROOT
 from thesis_repro.data.cityscapes import read_label_map
 from thesis_repro.data.sequence import Sequence
@@ -20,7 +20,7 @@ from thesis_repro.odometry.loop import OPENCV, detect, normalise
 from thesis_repro.running import program
 from thesis_repro.segmentation import prediction
 
-FOLDER = real_streets.FOLDER / "pictures"
+FOLDER = real_frames.FOLDER / "pictures"
 WIDTH = 10  # dilation width of masks, pixels
 FEW_SPREAD = 200  # spread keypoints
 DIMMED = 2  # times darker beside the mask
@@ -37,7 +37,7 @@ NOTE = (
 def opened(root, name):
     """Open a street of the evidence. Raises InputError if its frames are others."""
     sequence = Sequence(root, name)
-    if real_streets.differences(sequence, real_streets.read_manifest().loc[name]):
+    if real_frames.differences(sequence, real_frames.read_manifest().loc[name]):
         raise InputError(f"{sequence.folder}: has other frames than the evidence; make excerpts")
     return sequence
 

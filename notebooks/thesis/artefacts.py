@@ -17,7 +17,7 @@ from numba.core import event as numba_events
 import street_world
 from keypoint_study.jobs import CONTROL_WIDTH
 from keypoint_study.report import style
-from thesis import real_streets
+from thesis import real_frames
 from thesis.run_settings import Settings, read_settings
 from thesis_repro.data import cityscapes, kitti
 from thesis_repro.data.sequence import Sequence
@@ -240,7 +240,7 @@ def results() -> tuple[pd.DataFrame, pd.DataFrame, str]:
     Without notebook 8 they are those of the real streets in git.
     """
     build = read_settings().build
-    folder, whose = real_streets.FOLDER, "the real streets in git, because notebook 8 was not run"
+    folder, whose = real_frames.FOLDER, "the real streets in git, because notebook 8 was not run"
     if (build / "shuffled_runs.csv").is_file():
         folder, whose = build, "this run"
     runs, shuffled = (

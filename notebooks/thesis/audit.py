@@ -60,14 +60,14 @@ def share(row: str, key: str, percentages: Any, **more: Any) -> dict[str, Any]:
 
 
 def ratio(
-    row: str, key: str, of_streets: Any, geometric_mean: bool = False, **more: Any
+    row: str, key: str, by_sequence: Any, geometric_mean: bool = False, **more: Any
 ) -> dict[str, Any]:
     """Return one measurement for a row of the audit: the ratio over one ratio a sequence.
 
     It is the typical ratio, or the geometric mean.
     """
     names = ("mean", "mean_low", "mean_high") if geometric_mean else ("ratio", "low", "high")
-    typical = ratios.typical_ratio(of_streets)
+    typical = ratios.typical_ratio(by_sequence)
     value, low, high = (typical[name] for name in names)
     return measurement(
         row, key, [], "ratio", value=value, low=low, high=high, n=typical["n"], **more

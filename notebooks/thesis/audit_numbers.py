@@ -302,22 +302,22 @@ def _of_shuffles(runs: pd.DataFrame) -> list[dict[str, Any]]:
 
 
 def measurements_of_run(
-    settings: Settings, drives: list[Sequence], repetitions: int, frames: int
+    settings: Settings, sequences: list[Sequence], repetitions: int, frames: int
 ) -> list[dict[str, Any]]:
     """Return the measurements of all rows that are not live, for `audit_table`.
 
-    drives: the sequences of the ablations. repetitions: of each ablation. frames: of each sequence,
+    sequences: of the ablations. repetitions: of each ablation. frames: of each sequence,
     whose boundaries are measured. Writes ablations.csv. Rows of notebooks that were not run have no
     numbers.
     """
     labels = artefacts.label_maps()
-    ablated = run_ablations(drives, labels, settings.build / "audit", repetitions, settings.jobs)
+    ablated = run_ablations(sequences, labels, settings.build / "audit", repetitions, settings.jobs)
     artefacts.write_text("ablations.csv", ablated.to_csv(index=False))
     return [
-        *of_shares(map_quality.boundaries(drives, labels, frames)),
+        *of_shares(map_quality.boundaries(sequences, labels, frames)),
         *of_ablations(ablated),
-        *of_shares(map_quality.right_pixels(settings, drives, labels)),
-        *of_earlier_notebooks(settings, len(drives)),
+        *of_shares(map_quality.right_pixels(settings, sequences, labels)),
+        *of_earlier_notebooks(settings, len(sequences)),
     ]
 
 

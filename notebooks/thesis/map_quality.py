@@ -16,7 +16,7 @@ from thesis_repro.data.sequence import Sequence
 from thesis_repro.masks import MaskSettings
 
 IMAGES = 100  # most images of a domain
-LABELLED_FRAMES = 50  # most frames of all drives together
+LABELLED_FRAMES = 50  # most frames of all sequences together
 DRIVES = "the odometry's frames"  # the domain for which masks are made
 # a model and a domain with images that are in the model's training data
 SEEN = ("the model in the package", "KITTI's street scenes")
@@ -69,16 +69,18 @@ def scores_of_models(
     return pd.DataFrame(rows)
 
 
-def labelled_frames(drives: list[Sequence]) -> list[cityscapes.Pair]:
+def labelled_frames(sequences: list[Sequence]) -> list[cityscapes.Pair]:
     """Return evenly spread frames of sequences with their exact label maps; none for real data."""
     pairs = []
-    for drive in drives:
-        label_folder = drive.folder / kitti.TRUE_LABELS
+    for sequence in sequences:
+        label_folder = sequence.folder / kitti.TRUE_LABELS
         if label_folder.is_dir():
-            count = min(len(drive), max(1, LABELLED_FRAMES // len(drives)))
-            middles = (np.arange(count) + 0.5) * len(drive) / count  # of equal parts of the drive
-            for path in (drive.frame_paths[index] for index in middles.astype(int)):
-                name = f"{drive.name}_{path.stem}"
+            count = min(len(sequence), max(1, LABELLED_FRAMES // len(sequences)))
+            middles = (
+                (np.arange(count) + 0.5) * len(sequence) / count
+            )  # of equal parts of the sequence
+            for path in (sequence.frame_paths[index] for index in middles.astype(int)):
+                name = f"{sequence.name}_{path.stem}"
                 pairs.append(cityscapes.Pair(name, path, label_folder / path.name))
     return pairs
 
@@ -114,16 +116,16 @@ def label_map_quality(build: Path) -> pd.DataFrame:
 # By area of the frame
 
 
-def right_pixels(settings: Settings, drives: list[Sequence], labels: Path) -> pd.DataFrame:
+def right_pixels(settings: Settings, sequences: list[Sequence], labels: Path) -> pd.DataFrame:
     """Compare label maps with the exact ones, if there are any; returns one row a frame."""
     rows = []
-    for drive in drives:
-        whole = Sequence(settings.kitti, drive.name).subset(settings.sizes.frames).subset(FRAMES)
-        true_folder = drive.folder / kitti.TRUE_LABELS
+    for sequence in sequences:
+        whole = Sequence(settings.kitti, sequence.name).subset(settings.sizes.frames).subset(FRAMES)
+        true_folder = sequence.folder / kitti.TRUE_LABELS
         for index, name in enumerate(whole.label_names if true_folder.is_dir() else ()):
-            predicted = read_label_map(labels / drive.name / name)
+            predicted = read_label_map(labels / sequence.name / name)
             shares = right_shares(predicted, read_label_map(true_folder / name), whole.frame(index))
-            rows.append({"sequence": drive.name, "frame": index} | shares)
+            rows.append({"sequence": sequence.name, "frame": index} | shares)
     return pd.DataFrame(rows)
 
 
@@ -154,7 +156,7 @@ def right_shares(predicted: np.ndarray, exact: np.ndarray, frame: np.ndarray) ->
 # Boundaries
 
 
-def boundaries(drives: list[Sequence], labels: Path, frames: int) -> pd.DataFrame:
+def boundaries(sequences: list[Sequence], labels: Path, frames: int) -> pd.DataFrame:
     """Measure the boundaries of label maps; returns one row for each of some frames of a sequence.
 
     Columns: lost, the share (%) of boundary pixels that Canny on enlarged ids loses; "thin 5/15"
@@ -162,16 +164,16 @@ def boundaries(drives: list[Sequence], labels: Path, frames: int) -> pd.DataFram
     objects are those of the exact label maps, if there are any. NaN without boundaries.
     """
     rows = []
-    for drive in drives:
-        own, exact = labels / drive.name, drive.folder / kitti.TRUE_LABELS
-        for index in range(0, len(drive), max(1, len(drive) // frames)):
-            name = drive.frame_paths[index].name
+    for sequence in sequences:
+        own, exact = labels / sequence.name, sequence.folder / kitti.TRUE_LABELS
+        for index in range(0, len(sequence), max(1, len(sequence) // frames)):
+            name = sequence.frame_paths[index].name
             label_map = read_label_map(own / name)
             thin_map = read_label_map((exact if exact.is_dir() else own) / name)
-            row = {"sequence": drive.name, "frame": index}
-            row["lost"] = 100 - found_boundaries(label_map, drive.size, EXACT)
+            row = {"sequence": sequence.name, "frame": index}
+            row["lost"] = 100 - found_boundaries(label_map, sequence.size, EXACT)
             for low, high in THRESHOLDS:
-                found = found_boundaries(thin_map, drive.size, THIN, (low, high))
+                found = found_boundaries(thin_map, sequence.size, THIN, (low, high))
                 row[f"thin {low}/{high}"] = found
             rows.append(row)
     return pd.DataFrame(rows)

@@ -13,7 +13,7 @@ import sys
 from itertools import chain
 from pathlib import Path
 
-from thesis import book, gallery, real_streets
+from thesis import book, gallery, real_frames
 from thesis.run_settings import ROOT, Settings, read_settings
 from thesis_repro.checks import report
 from thesis_repro.data import cityscapes, kitti
@@ -80,7 +80,7 @@ def check(settings: Settings) -> bool:
     changed: then the notebooks are executed again. Raises InputError if a file is missing.
     """
     for name, first, last in settings.ranges:
-        real_streets.cut(Sequence(settings.whole, name), first, last, settings.kitti, name)
+        real_frames.cut(Sequence(settings.whole, name), first, last, settings.kitti, name)
     path = settings.build / "checked"
     kitti_root = None if settings.kitti_is_embedded else settings.kitti
     cityscapes_root = None if settings.cityscapes_is_embedded else settings.cityscapes

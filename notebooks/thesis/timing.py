@@ -28,7 +28,7 @@ from keypoint_study.best_width import percent_change
 from keypoint_study.jobs import CONTROL_WIDTH
 from keypoint_study.report import style
 from keypoint_study.sources import Source
-from thesis import REPORTED, real_streets
+from thesis import REPORTED, real_frames
 from thesis.run_settings import ROOT, Settings, cores
 from thesis_repro import masks, odometry
 from thesis_repro.data.cityscapes import resize_bilinear
@@ -207,8 +207,8 @@ def folder(settings: Settings) -> Path:
     """Return the folder of the times that a run's figures show: in git for figures in git."""
     if settings.figures_in_git:
         return ROOT / "figures" / "timings"
-    if real_streets.is_evidence(settings):
-        return real_streets.FOLDER / "timings"
+    if real_frames.is_evidence(settings):
+        return real_frames.FOLDER / "timings"
     return settings.figures / "timings"
 
 

@@ -9,7 +9,7 @@ import pytest
 
 import evidence
 import excerpts as command
-from thesis import real_streets, run
+from thesis import real_frames, run
 from thesis.run_settings import read_settings
 from thesis_repro.data.sequence import Sequence
 from thesis_repro.errors import InputError
@@ -21,29 +21,29 @@ def settings_of(**variables):
 
 def test_a_cut_has_the_frames_poses_and_times_of_their_numbers(tiny_kitti, tmp_path):
     whole = Sequence(tiny_kitti, "00")
-    part = real_streets.cut(whole, 1, 2, tmp_path / "cut", "part")
+    part = real_frames.cut(whole, 1, 2, tmp_path / "cut", "part")
     assert part.name == "part" and len(part) == 2
     for index in (0, 1):
         assert np.array_equal(part.frame(index), whole.frame(index + 1))
     assert np.array_equal(part.poses, whole.poses[1:3])
     assert np.array_equal(part.times, whole.times[1:3])
     assert np.array_equal(part.intrinsics, whole.intrinsics)
-    second = real_streets.cut(whole, 0, 3, tmp_path / "cut", "second", every=2)
+    second = real_frames.cut(whole, 0, 3, tmp_path / "cut", "second", every=2)
     assert [path.name for path in second.frame_paths] == ["000000.png", "000002.png"]
     assert np.array_equal(second.poses, whole.poses[::2])
     assert np.array_equal(second.times, whole.times[::2])
     with pytest.raises(InputError, match="00: has 4 frames; 2 to 4 "):
-        real_streets.cut(whole, 2, 4, tmp_path / "cut", "part")
+        real_frames.cut(whole, 2, 4, tmp_path / "cut", "part")
 
 
 def test_a_second_cut_writes_only_what_differs(tiny_kitti, tmp_path):
     whole = Sequence(tiny_kitti, "00")
-    part = real_streets.cut(whole, 0, 2, tmp_path, "00")
+    part = real_frames.cut(whole, 0, 2, tmp_path, "00")
     times = [path.lstat().st_mtime_ns for path in part.files]
     assert [
-        path.lstat().st_mtime_ns for path in real_streets.cut(whole, 0, 2, tmp_path, "00").files
+        path.lstat().st_mtime_ns for path in real_frames.cut(whole, 0, 2, tmp_path, "00").files
     ] == times
-    shorter = real_streets.cut(whole, 1, 2, tmp_path, "00")
+    shorter = real_frames.cut(whole, 1, 2, tmp_path, "00")
     assert [path.name for path in shorter.frame_paths] == ["000001.png", "000002.png"]
 
 
@@ -69,11 +69,11 @@ def manifest(tiny_kitti, tmp_path, monkeypatch):
     """A manifest of frames 0 to 2 of the tiny sequence, and of a raw drive."""
     street = Sequence(tiny_kitti, "00").subset(3)
     row = {"street": "00", "data": "odometry", "sequence": "00", "camera": "image_0"}
-    row |= {"first": 0, "last": 2, "made": "as published", **real_streets.digests(street)}
+    row |= {"first": 0, "last": 2, "made": "as published", **real_frames.digests(street)}
     drive = row | {"street": "drive1", "data": "raw", "sequence": "0001", "date": "2011_09_26"}
     path = tmp_path / "frames.csv"
     pd.DataFrame([row, drive]).to_csv(path, index=False)
-    monkeypatch.setattr(real_streets, "MANIFEST", path)
+    monkeypatch.setattr(real_frames, "MANIFEST", path)
     return street
 
 
@@ -90,9 +90,9 @@ def test_evidence_of_other_frames_goes_elsewhere(manifest, tiny_kitti, tmp_path,
     whole = settings_of(PROFILE="thesis", **given)
     elsewhere = evidence.folder_of(whole)  # other frames
     assert elsewhere.parent == tmp_path / "figures" and elsewhere.name.endswith("-evidence")
-    table = pd.read_csv(real_streets.MANIFEST, dtype=str)
-    table[table["street"] == "00"].to_csv(real_streets.MANIFEST, index=False)
-    real_streets.cut(manifest, 0, 2, tmp_path / "cut", "00")
+    table = pd.read_csv(real_frames.MANIFEST, dtype=str)
+    table[table["street"] == "00"].to_csv(real_frames.MANIFEST, index=False)
+    real_frames.cut(manifest, 0, 2, tmp_path / "cut", "00")
     cut = given | {"KITTI": tmp_path / "cut"}
     assert evidence.folder_of(settings_of(PROFILE="thesis", **cut)) == evidence.FOLDER
     assert evidence.folder_of(settings_of(PROFILE="smoke", **cut)) != evidence.FOLDER
@@ -103,11 +103,11 @@ def test_the_manifest_is_that_of_the_real_frames(kitti_real, tmp_path):
     raw = kitti_real.parent / "kitti_raw"
     told = command.cut_streets(str(kitti_real), str(raw), tmp_path)
     assert list(told) == ["drive0009"]  # only its rectified frames are at hand
-    street = real_streets.read_manifest().loc["drive0009"]
-    assert real_streets.differences(Sequence(kitti_real, "drive0009"), street) == []
+    street = real_frames.read_manifest().loc["drive0009"]
+    assert real_frames.differences(Sequence(kitti_real, "drive0009"), street) == []
     for name in ("drive0005", "drive0095"):
         poses = np.loadtxt(raw / "poses" / f"{name}.txt").reshape(-1, 3, 4)
         made = Sequence(tmp_path, name).poses[:, :3]
         assert np.array_equal(
-            np.round(made, real_streets.DECIMALS), np.round(poses, real_streets.DECIMALS)
+            np.round(made, real_frames.DECIMALS), np.round(poses, real_frames.DECIMALS)
         )

@@ -23,7 +23,7 @@ from scipy import stats
 
 import thesis_repro as tr
 from keypoint_study import comparisons
-from thesis import artefacts, audit, real_streets, tables
+from thesis import artefacts, audit, real_frames, tables
 from thesis.run_settings import PREFIX, ROOT, read_settings
 from thesis_repro import masks
 from thesis_repro.data import cityscapes
@@ -305,7 +305,7 @@ def test_a_cell_that_compiles_says_so_once(capsys, monkeypatch):
 def test_notebook_9_says_whose_runs_it_reads(build):
     assert "real streets" in run("09", "14", artefacts=artefacts)["printed"]
     for name in ("runs.csv", "shuffled_runs.csv"):
-        shutil.copy(real_streets.FOLDER / name, build)
+        shutil.copy(real_frames.FOLDER / name, build)
     assert artefacts.results()[2] == "this run"
 
 

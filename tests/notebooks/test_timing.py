@@ -4,7 +4,7 @@ import pandas as pd
 import pytest
 
 from keypoint_study.sources import Source
-from thesis import real_streets, timing
+from thesis import real_frames, timing
 from thesis.run_settings import read_settings
 from thesis_repro.data.sequence import Sequence
 from thesis_repro.errors import InputError
@@ -34,8 +34,8 @@ def test_what_a_machine_measures_changes_no_figure_in_git(monkeypatch, tmp_path,
     settings = read_settings({"THESIS_REPRO_BUILD": str(tmp_path / "build")})
     if is_evidence:
         settings = read_settings({"THESIS_REPRO_PROFILE": "thesis"})
-        monkeypatch.setattr(real_streets, "is_evidence", lambda _: True)
-        monkeypatch.setattr(real_streets, "FOLDER", tmp_path)
+        monkeypatch.setattr(real_frames, "is_evidence", lambda _: True)
+        monkeypatch.setattr(real_frames, "FOLDER", tmp_path)
         (tmp_path / "timings").mkdir()
         MEASURED.assign(seconds=7.0).to_csv(tmp_path / "timings/seconds.csv")
     path = timing.folder(settings) / "seconds.csv"
