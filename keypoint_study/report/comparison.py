@@ -49,7 +49,7 @@ CAPTIONS = {
     "errors": (
         "Every sequence",
         "The two errors that decide, for each estimator: mean and standard deviation over the "
-        "repetitions (none if it is 0 in these digits). The lowest mean of a sequence is bold; a "
+        "shuffles (none if it is 0 in these digits). The lowest mean of a sequence is bold; a "
         "smaller difference than the deviations may be chance. With several sources of masks, the "
         "controls stand in the table of ratios only.",
     ),
@@ -58,8 +58,8 @@ CAPTIONS = {
         "Ratios of errors to all keypoints with the best width of each sequence (chosen by its error "
         "there), with the width chosen on the other sequences, and with one width for all. The row "
         "“all sequences” has the typical ratio with its interval. If all widths are repeated, two "
-        "columns show how much is chance: the best width of one repetition evaluated in the other "
-        "repetitions, and how often two repetitions agree on the best width. The choices share data, "
+        "columns show how much is chance: the best width of one shuffle evaluated in the other "
+        "shuffles, and how often two shuffles agree on the best width. The choices share data, "
         "so the intervals of the chosen widths are too narrow.",
     ),
 }

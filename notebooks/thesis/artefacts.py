@@ -177,7 +177,7 @@ def with_sliders(draw: Callable[..., plt.Figure], **sliders: Any) -> None:
 # What a lesson that is opened first makes: rendered sequences and label maps. What is there stays.
 
 
-def drives() -> list[Sequence]:
+def sequences() -> list[Sequence]:
     """Return the sequences of the run. Those of the embedded world are rendered if need be."""
     settings = read_settings()
     if settings.kitti_is_embedded:
@@ -196,10 +196,10 @@ def label_maps() -> Path:
     if network_of_label_maps() not in (None, NETWORK_IN_PACKAGE):
         return labels
     missing = []
-    for drive in drives():
-        paths = [labels / drive.name / f"{path.stem}.png" for path in drive.frame_paths]
+    for each in sequences():
+        paths = [labels / each.name / f"{path.stem}.png" for path in each.frame_paths]
         if not all(path.is_file() for path in paths):
-            missing.append(drive)
+            missing.append(each)
     if not missing:
         return labels
     print(f"{IN_PACKAGE} makes the label maps, once: a minute or less", flush=True)
@@ -208,9 +208,9 @@ def label_maps() -> Path:
     with quietly():  # what TensorFlow prints when it starts is no error
         from thesis_repro.segmentation import prediction
     model = prediction.load_shipped()
-    for drive in missing:
-        folder = labels / drive.name
-        prediction.write_label_maps(model, drive.frame_paths, folder, lens=drive.lens)
+    for each in missing:
+        folder = labels / each.name
+        prediction.write_label_maps(model, each.frame_paths, folder, lens=each.lens)
     return labels
 
 

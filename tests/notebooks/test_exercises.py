@@ -391,7 +391,7 @@ def ranges(*edits):
     """Lowest and highest errors of each choice of notebook 7."""
     names = run("07", CHOICES, *edits)
     rows = pd.DataFrame(
-        {"choice": text} | names["errors"](each.poses, names["drive"])
+        {"choice": text} | names["errors"](each.poses, names["part"])
         for (text, _), each in names["many"].items()
     ).groupby("choice")
     return rows.min(), rows.max()
@@ -399,7 +399,7 @@ def ranges(*edits):
 
 def test_exercise_07_1(build):
     long = (
-        "drives[SEQUENCE or min(drives)].subset(FRAMES)",
+        "sequences[SEQUENCE or min(sequences)].subset(FRAMES)",
         "earlier.Sequence(settings.kitti, '00')",
     )
     low, high = ranges(long)
