@@ -400,7 +400,7 @@ def ranges(*edits):
 def test_exercise_07_1(build):
     long = (
         "sequences[SEQUENCE or min(sequences)].subset(FRAMES)",
-        "earlier.Sequence(settings.kitti, '00')",
+        "artefacts.Sequence(settings.kitti, '00')",
     )
     low, high = ranges(long)
     assert low.loc["500 keypoints", "RMSE (m)"] < high.loc["as above", "RMSE (m)"]  # they overlap
