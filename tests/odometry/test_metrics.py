@@ -45,26 +45,6 @@ def drive(seed=None):
 
 MOUNTING = lie.se3(rotation(2, -3, 1).as_matrix(), np.zeros(3))
 TRUE, ESTIMATED = drive(), MOUNTING @ drive(seed=0) @ MOUNTING.T
-RECORDED = {
-    "none": 16.0717852,
-    "sim3": 4.092430452,
-    "rmse": 16.09226995,
-    "mae": 7.942548105,
-    "se3": 4.339526184,
-    "translation_percent": 3.260676328,
-    "rotation_deg_per_100m": 8.919723626,
-    "rotation": 0.2688606425,
-    "in_turns": 0.254383936,
-    "on_straights": 0.2695849804,
-    "direction": 4.15967539,
-    "across": -3.096807714,
-    "down": -1.961542487,
-    "failed": 3.149606299,
-    "steps": 889,
-    "lost": 0,
-    "t_rel": 5.061025669,
-    "r_rel": 2.132205746,
-}
 
 
 def measured(estimated, true):
@@ -176,9 +156,8 @@ def by_hand(estimated, true):
     }
 
 
-def test_every_error_of_a_kilometre_is_the_recorded_one_and_that_worked_out_by_hand():
+def test_every_error_of_a_kilometre_is_that_worked_out_by_hand():
     errors = measured(ESTIMATED, TRUE)
-    assert errors == pytest.approx(RECORDED, rel=1e-6)
     assert errors == pytest.approx(by_hand(ESTIMATED, TRUE), rel=1e-5)
     assert np.linalg.norm(metrics.shifted(ESTIMATED, TRUE)[1] - TRUE[1], axis=0)[3] < 1e-12
 
@@ -190,12 +169,6 @@ def test_a_rotation_between_two_cameras_is_no_reflection():
     poses = [lie.se3(rotation(*turn).as_matrix(), shift) for turn, shift in zip(turns, shifts)]
     given = np.array(poses), winding(40)
     assert metrics.relative_errors(*given) == pytest.approx(over_twenty_metres(*given), rel=1e-3)
-
-
-def test_paths_of_different_or_no_length_are_refused():
-    for estimated, true in ((ahead(3), ahead(2)), (ahead(1), ahead(1))):
-        with pytest.raises(InputError):
-            metrics.rmse(estimated, true)
 
 
 def test_a_path_that_is_too_short_or_straight_has_no_such_error():
@@ -241,9 +214,13 @@ def test_a_small_angle_is_exact():
     assert metrics.angles(rotations) == pytest.approx(small, rel=1e-6)
 
 
-@pytest.mark.parametrize("shape", [(5, 3), (5, 3, 4), (5, 16)])
-def test_paths_of_other_shapes_are_named(shape):
-    for pair in ((np.zeros(shape), ahead(5)), (ahead(5), np.zeros(shape))):
+@pytest.mark.parametrize(
+    "shape, count, named",
+    [((5, 3), 5, "(5, 3)"), ((5, 3, 4), 5, "(5, 3, 4)"), ((5, 16), 5, "(5, 16)")]
+    + [((4, 4, 4), 5, "one pose a frame"), ((1, 4, 4), 1, "at least 2 frames")],
+)
+def test_paths_of_other_shapes_and_lengths_are_named(shape, count, named):
+    for pair in ((np.zeros(shape), ahead(count)), (ahead(count), np.zeros(shape))):
         for error in (metrics.ate, metrics.rmse, metrics.errors):
-            with pytest.raises(InputError, match=re.escape(f"{shape}")):
+            with pytest.raises(InputError, match=re.escape(named)):
                 error(*pair)

@@ -10,9 +10,9 @@ import platform
 import numpy as np
 import pandas as pd
 import pytest
+from reference_steps import FOLDER, SETTINGS, STEPS, digest
 
 import thesis_repro
-from reference_steps import FOLDER, SETTINGS, STEPS, digest
 from thesis_repro.data.sequence import Sequence
 from thesis_repro.masks.folders import MaskFolder
 from thesis_repro.odometry import THESIS, Matches, metrics, sharing
