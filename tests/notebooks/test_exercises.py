@@ -13,7 +13,6 @@ from contextlib import redirect_stdout
 from io import StringIO
 
 import cv2
-import matplotlib.pyplot as plt
 import numba
 import numpy as np
 import pandas as pd
@@ -459,11 +458,3 @@ def test_exercise_09_2(build):
     names |= {"cityscapes": cityscapes, "artefacts": artefacts}
     usual, edited = (run("09", "25 28", CANNY=c, **names)["lost"] for c in ((5, 15), (1, 3)))
     assert edited < usual / 2
-
-
-def test_exercise_09_3():
-    kept = {}
-    for side in (10, 5):
-        names = {"cv2": cv2, "np": np, "plt": plt, "SQUARE": side}
-        run("09", "31", keep=lambda *_, side=side: kept.update({side: _[2]}), **names)
-    assert kept == {10: 0.5, 5: 0.0}
