@@ -93,7 +93,7 @@ def test_the_verdict_follows_the_interval(factor, verdict):
 def test_intervals_that_exclude_the_true_ratio_by_chance():
     """Print the percentages of docs/reading-results.md.
 
-    Call it with pytest -m torture -s -k by_chance tests/study.
+    Call it with pytest -m torture -s -k by_chance tests/keypoint_study.
     """
     random = np.random.default_rng(0)
     draws = {
@@ -244,10 +244,6 @@ def test_sequences_far_off_the_mean_are_named():
     rows = comparisons.comparisons_of(runs)
     far_off = rows.loc[rows["method"] == "masked", "far_off"]
     assert set(far_off.map(tuple)) == {("03", "05")}
-    # two sequences do not show which one is far off
-    assert ratios.far_off(pd.Series({"00": 1.0, "01": 90.0})) == []
-    assert ratios.far_off(pd.Series(dict.fromkeys(EIGHT, 2.9) | {"01": 1.0})) == []
-    assert ratios.far_off(pd.Series({"00": 1.0, "01": 0.6, "02": 1.4, "03": 90.0})) == ["03"]
 
 
 def parts_of(

@@ -52,15 +52,15 @@ def scheduler(tmp_path_factory):
         yield address
 
 
-@pytest.fixture
-def two_workers(scheduler, tmp_path):
-    options = ("--no-nanny", "--nthreads", 1, "--local-directory", tmp_path / "scratch")
-    processes = [start(tmp_path, "worker", scheduler, *options) for _ in range(2)]
+@contextmanager
+def started_workers(folder, address, count):
+    options = ("--no-nanny", "--nthreads", 1, "--local-directory", folder / "scratch")
+    processes = [start(folder, "worker", address, *options) for _ in range(count)]
     from dask.distributed import Client
 
     try:
-        with Client(scheduler, set_as_default=False) as client:
-            client.wait_for_workers(2, timeout=120)
+        with Client(address, set_as_default=False) as client:
+            client.wait_for_workers(count, timeout=120)
         yield processes
     finally:
         for process in processes:
@@ -78,7 +78,7 @@ def test_an_unusable_scheduler_is_one_line(scheduler, monkeypatch):
 
 
 def test_a_cluster_gives_the_same_bits_although_a_worker_is_killed(
-    small_world, small_labels, two_workers, scheduler, tmp_path
+    small_world, small_labels, scheduler, tmp_path
 ):
     opened = [Sequence(small_world / "kitti", name) for name in ("00", "01")]
     jobs = first_jobs(opened, {"thesis": (5,)}, repetitions=2)
@@ -86,14 +86,15 @@ def test_a_cluster_gives_the_same_bits_although_a_worker_is_killed(
     here = runner.run_all(runs, tmp_path / "here")
     there = tmp_path / "there"
 
-    def kill():
+    def kill(worker):
         wait_for(lambda: list(there.rglob("[!.]*.csv")))
-        two_workers[0].kill()
+        worker.kill()
 
-    killer = threading.Thread(target=kill)
-    killer.start()
-    result = runner.run_all(runs, there, scheduler=scheduler)
-    killer.join()
+    with started_workers(tmp_path, scheduler, 2) as processes:
+        killer = threading.Thread(target=kill, args=processes[:1])
+        killer.start()
+        result = runner.run_all(runs, there, scheduler=scheduler)
+        killer.join()
     pd.testing.assert_frame_equal(result.table, here.table, check_exact=True)
 
 
@@ -102,21 +103,12 @@ def test_a_cluster_gives_the_same_bits_although_a_worker_is_killed(
 )
 def test_a_scheduler_that_ends_or_hangs_is_named(tmp_path, monkeypatch, capfd, number):
     monkeypatch.setattr(workers, "TIMEOUT", 3)
-    with started_scheduler(tmp_path) as (process, address):
-        options = ("--no-nanny", "--nthreads", 1, "--local-directory", tmp_path / "scratch")
-        worker = start(tmp_path, "worker", address, *options)
-        try:
-            from dask.distributed import Client
-
-            with Client(address, set_as_default=False) as client:
-                client.wait_for_workers(1, timeout=120)
-            with (
-                pytest.raises(InputError, match=f"{address}: no longer answers"),
-                workers.open_pool(1, address) as pool,
-            ):
-                threading.Timer(2, process.send_signal, [number]).start()
-                list(pool.run(time.sleep, [(60,)]))
-        finally:
-            worker.kill()
-            worker.wait()
+    with (
+        started_scheduler(tmp_path) as (process, address),
+        started_workers(tmp_path, address, 1),
+        pytest.raises(InputError, match=f"{address}: no longer answers"),
+        workers.open_pool(1, address) as pool,
+    ):
+        threading.Timer(2, process.send_signal, [number]).start()
+        list(pool.run(time.sleep, [(60,)]))
     assert "Traceback" not in capfd.readouterr().err

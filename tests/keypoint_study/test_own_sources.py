@@ -153,6 +153,7 @@ def test_own_keypoints_are_drawn(street, capsys):
         ("folder.py", None, "must be a Python file"),
         ("wrong.py", b"def detect(frame, settings, mask)\n    return None\n", "SyntaxError"),
         ("data.py", b"\x89HDF\r\n" + bytes(99), "SyntaxError"),
+        ("five.py", b"detector = 5", "must define"),
         ("other.py", b"import not_installed_here\n", "No module named 'not_installed_here'"),
     ],
 )

@@ -58,17 +58,6 @@ def test_a_run_equals_the_odometry_of_its_sequence(small_world, small_labels, fi
     assert np.array_equal(runner.run_poses(summary, folder)["01", "masked-15-0"], alone.poses)
 
 
-def test_only_missing_runs_are_run_again(small_world, small_labels, finished):
-    folder, jobs, summary = finished
-    times = {path: path.stat().st_mtime_ns for path in folder.rglob("*.csv")}
-    missing = folder / "00" / "masked-05-0.csv"
-    missing.unlink()
-    again = runner.run_all(runs_of(jobs, opened(small_world), [Source(small_labels)]), folder)
-    assert [path for path in times if path.stat().st_mtime_ns != times[path]] == [missing]
-    pd.testing.assert_frame_equal(again.table, summary)
-    assert (again.made, again.kept, len(again.reasons)) == (1, len(jobs) - 1, 0)
-
-
 def test_a_stopped_pass_is_repeated_and_ends_as_an_undisturbed_one(
     small_world, small_labels, finished, tmp_path, monkeypatch
 ):
@@ -209,23 +198,13 @@ def test_first_jobs_are_complete_and_have_different_names(small_world, tiny_kitt
 # The time of a frame, stage by stage; the timed steps are the steps of a real run
 
 
-@pytest.fixture(scope="module")
-def model(small_model):
-    return training.load_model(small_model)
-
-
-@pytest.fixture
-def sequence(small_world, monkeypatch):
-    monkeypatch.setattr(timing, "FRAMES", 2)
-    return Sequence(small_world / "kitti", "00")
-
-
-def test_a_slow_stage_shows_in_its_row(sequence, model, monkeypatch):
+def test_a_slow_stage_shows_in_its_row(small_world, small_model, monkeypatch):
+    sequence = opened(small_world)[0]
     keypoint_mask = masks.keypoint_mask
     monkeypatch.setattr(
         masks, "keypoint_mask", lambda *given: (keypoint_mask(*given), time.sleep(0.3))[0]
     )
-    table = timing.time_stages(sequence, model, width=5, frames=2)
+    table = timing.time_stages(sequence, training.load_model(small_model), width=5, frames=2)
     assert (
         list(table.columns) == ["method", "stage", "milliseconds"]
         and (table["milliseconds"] > 0).all()

@@ -222,15 +222,6 @@ def test_own_keypoints_are_rows_as_masks_are(brought, tmp_path):
     assert again.table["se3"].equals(runs["se3"])
 
 
-def test_what_is_no_keypoints_is_named(brought, tmp_path):
-    (tmp_path / "mine.py").write_text("detector = 5")
-    with pytest.raises(InputError, match="mine.py: must define"):
-        brought.check()
-    (tmp_path / "mine.py").unlink()
-    with pytest.raises((InputError, OSError), match="mine.py"):
-        brought.check()
-
-
 def test_results_of_another_length_are_kept(done, study):
     before = files(done[0])
     with pytest.raises(InputError, match="other settings"):

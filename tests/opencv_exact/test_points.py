@@ -34,11 +34,17 @@ def cv2_essential(new, old):
 
 MATRIX, _ = cv2_essential(NEW, OLD)
 OWN = lambda new, old: find_essential_matrix(new, old, threshold=THRESHOLD)  # noqa: E731
-PAIRED = {
-    "search": (cv2_essential, OWN),
+CALLS = {  # OpenCV's, the own, and points to call them with
+    "search": (cv2_essential, OWN, (NEW, OLD)),
     "vote": (
         lambda new, old: cv2.recoverPose(MATRIX, new, old),
         lambda new, old: recover_pose(MATRIX, new, old),
+        (NEW, OLD),
+    ),
+    "track": (
+        lambda points: cv2.calcOpticalFlowPyrLK(FRAME, LATER, points, None)[:2],
+        lambda points: track(FRAME, LATER, points)[:2],
+        (CORNERS,),
     ),
 }
 
@@ -54,35 +60,23 @@ def is_taken(theirs, own, *values):
     return True
 
 
-@pytest.mark.parametrize("call", PAIRED)
-def test_pairs_of_any_shape_are_taken_or_refused_as_by_opencv(call):
-    taken = [
-        name for name, shape in SHAPES.items() if is_taken(*PAIRED[call], shape(NEW), shape(OLD))
-    ]
+@pytest.mark.parametrize("call", CALLS)
+def test_points_of_any_shape_are_taken_or_refused_as_by_opencv(call):
+    theirs, own, points = CALLS[call]
+    taken = []
+    for name, shape in SHAPES.items():
+        shaped = [np.ascontiguousarray(shape(side)) for side in points]
+        if is_taken(theirs, own, *shaped):
+            taken.append(name)
     assert taken == ["(N, 2)", "(N, 1, 2)", "(1, N, 2)"]
 
 
-@pytest.mark.parametrize("call", PAIRED)
+@pytest.mark.parametrize("call", ["search", "vote"])
 @pytest.mark.parametrize("fewer", [0, 1, 59])
 def test_unequal_numbers_are_refused_before_compiled_code_reads_past_an_end(call, fewer):
+    theirs, own, _ = CALLS[call]
     for pair in ((NEW, OLD[:fewer]), (NEW[:fewer], OLD)):
-        assert not is_taken(*PAIRED[call], *pair)
-
-
-def test_points_to_track_of_any_shape_are_taken_or_refused_as_by_opencv():
-    def theirs(points):
-        tracked, status, _ = cv2.calcOpticalFlowPyrLK(FRAME, LATER, points, None)
-        return tracked, status
-
-    def own(points):
-        return track(FRAME, LATER, points)[:2]
-
-    taken = [
-        name
-        for name, shape in SHAPES.items()
-        if is_taken(theirs, own, np.ascontiguousarray(shape(CORNERS)))
-    ]
-    assert taken == ["(N, 2)", "(N, 1, 2)", "(1, N, 2)"]
+        assert not is_taken(theirs, own, *pair)
 
 
 def test_arrays_of_a_graphics_card_are_refused_by_name():

@@ -5,12 +5,11 @@ Also the gap between domains, and the recorded network.
 
 from types import SimpleNamespace
 
-import made_up
 import numpy as np
 import pandas as pd
 import pytest
 
-from keypoint_study import comparisons
+import write_texts
 from keypoint_study.report import style
 from thesis import audit, audit_numbers, map_quality, run
 from thesis.run_settings import ROOT
@@ -60,32 +59,23 @@ def test_the_audit_has_the_times_of_the_budget_beside_it(folder):
     assert whole == pytest.approx(sums.iloc[0] / sums.iloc[1], rel=2e-3)
 
 
-def test_ablations_become_ratios_of_their_reference():
-    factors = {
-        "baseline": 1.0,
-        "masked": 0.5,
-        "symmetric": 0.25,
-        "dropout": 1.0,
-    }
-    runs = made_up.runs(
-        [f"{number:02d}" for number in range(8)],
-        lambda _, method, __: factors[method],
-        dict.fromkeys(factors, [None]),
-        estimators=("thesis", "inliers", "refined"),
-        noise=0.02,
+def test_ratios_of_runs_in_git_are_those_of_the_audit_in_git():
+    runs, shuffled, ablations = (
+        write_texts.read_table(f"{write_texts.REAL}{name}")
+        for name in ("runs", "shuffled_runs", "ablations")
     )
-    runs = runs.assign(failed=1.0, sim3=runs["rmse"])
-    measurements = pd.DataFrame(audit_numbers.of_ablations(runs))
-    ratios = measurements[measurements["unit"] == "ratio"].set_index(
-        ["row", "metric", "estimator"]
-    )["value"]
-    assert (
-        ratios["12", "RMSE", "refined"] == pytest.approx(0.5, rel=0.05)
-        and ratios["12", "keypoints", ""] == 1
-    )
-    assert ratios["59", "RMSE", "thesis"] == pytest.approx(1, rel=0.05)
-    assert set(measurements["frames"]) == {100}
-    assert not measurements["row"].isin(["48"]).any()  # ORB was not run
+    measured = [*audit_numbers.of_study(runs, shuffled), *audit_numbers.of_ablations(ablations)]
+    made = audit.audit_table(measured).dropna(subset="n")
+    in_git = pd.read_csv(ROOT / FOLDERS[1] / "audit.csv", dtype={"row": str}, keep_default_na=False)
+    in_git = in_git[in_git["data"] != "the thesis's numbers"]
+    named = ["row", "quantity", "metric", "estimator"]
+    both = made.merge(in_git, "left", named, suffixes=("", "_in_git"), validate="1:1")
+    assert len(both) > 100
+    for column in ("value", "low", "high", "n"):
+        expected = pd.to_numeric(both[f"{column}_in_git"])
+        assert both[column].tolist() == pytest.approx(expected.tolist(), rel=1e-3, nan_ok=True)
+    not_run = audit_numbers.of_ablations(ablations[ablations["method"] != "orb"])
+    assert "48" not in {line["row"] for line in not_run}
 
 
 def test_shares_of_pixels_are_means_over_the_sequences_with_their_number_of_frames():
@@ -138,29 +128,6 @@ def test_boundaries_between_close_ids_are_lost_and_between_distant_ids_found():
 
     assert found(7, 8) == 0 and found(7, 23) == 100
     assert np.isnan(found(20, 20))
-
-
-def test_the_audit_and_the_comparison_answer_a_question_with_the_same_number():
-    methods = {"baseline": 1.0, "masked": 0.5, "corrected": 0.8}
-    runs = made_up.runs(
-        [f"{number:02d}" for number in range(8)],
-        lambda _, method, __: methods[method],
-        {"baseline": [None], "masked": [5, 10], "corrected": [10]},
-        noise=0.3,
-    )
-    table = comparisons.comparisons_of(runs)
-    compared = table[table["tested"] & (table["reference"] == "baseline")].set_index(
-        ["method", "estimator", "metric"]
-    )
-    audited = pd.DataFrame(audit_numbers.of_study(runs, runs[runs["method"] == "baseline"]))
-    assert len(audited[audited["row"] == "39"]) == 2
-    for row, method in (("15", "masked"), ("50", "corrected")):
-        lines = audited[(audited["row"] == row) & (audited["metric"] == "RMSE")]
-        for line in lines[lines["quantity"].str.endswith("over all keypoints")].itertuples():
-            assert [line.value, line.low, line.high, line.n] == pytest.approx(
-                compared.loc[(method, line.estimator, "rmse"), ["ratio", "low", "high", "n"]]
-            )
-        assert len(lines) >= 2
 
 
 # The gap between domains, on made-up scores

@@ -1,6 +1,5 @@
 """Figures and tables of chapter 4, the comparison and the findings show the numbers of the runs."""
 
-import re
 from html import escape
 from types import SimpleNamespace
 
@@ -9,25 +8,18 @@ import numpy as np
 import pandas as pd
 import pytest
 from cells import cells
-from matplotlib.container import BarContainer
 
 from keypoint_study import comparisons, ratios, verdicts
-from keypoint_study.jobs import ESTIMATOR_TITLES
 from keypoint_study.path_errors import ERRORS
 from keypoint_study.report import comparison, findings, html, style, texts
 from thesis import REPORTED, chapter4, few_keypoints, tables, views
 from thesis_repro.errors import one_line
 
-AHEAD = np.array([[0, 0, z] for z in range(4)])  # true positions, metres
 ELEVEN = [f"{number:02d}" for number in range(11)]
 CONTROLS = comparisons.SEGMENTATION_FREE_CONTROLS
 NEVER_SHUFFLED = made_up.runs(
     ["00"], lambda *_: 1.0, {"baseline": [None]}, estimators=["thesis"], repetitions=1
 )
-
-
-def best_of(runs):
-    return tables.of_chosen_width(comparisons.of_method(runs, "masked"))
 
 
 def runs_of(names, errors, widths=(5, 10, 15), **options):
@@ -83,35 +75,6 @@ def test_tables_of_the_thesiss_numbers_equal_the_thesiss(
     ] == [10, 11]
 
 
-def test_failed_runs_are_counted():
-    runs = runs_of(ELEVEN, halved)
-    failing = (runs["sequence"] == "03") & (runs["method"] == "masked")
-    runs.loc[failing & (runs["repetition"] == 0), "failed"] = 5.0
-    table = tables.table_of_change(*widths_of(runs), NEVER_SHUFFLED, "rmse", "thesis").set_index(
-        "sequence"
-    )
-    assert table.loc["03", "failed runs, best mask"] == "1 of 3"
-    for column in ("change (%)", "change (%), one run each"):
-        assert table.loc["03", column] < 0 and table.loc["sequences improved", column] == 11
-    assert (
-        tables.table_4_1(widths_of(runs)[0], "thesis")
-        .set_index("sequence")
-        .loc["03", "failed runs"]
-        == "1 of 3"
-    )
-    compared = comparison.table_of_ratios(comparisons.comparisons_of(runs))
-    of_masks = compared[(compared["keypoints"] == "masks, width 10")].iloc[0]
-    # one run of three is not yet a sequence that fails
-    assert of_masks[comparison.FAIL] == "0 of 11"
-    runs.loc[failing & (runs["repetition"] == 1), "failed"] = 5.0
-    compared = comparison.table_of_ratios(comparisons.comparisons_of(runs))
-    of_masks = compared[(compared["keypoints"] == "masks, width 10")].iloc[0]
-    assert of_masks[comparison.FAIL] == "1 of 11"
-    assert of_masks[f"{comparison.FAIL}, of the reference"] == "0 of 11"
-    widths = comparison.table_of_widths(runs).content.set_index("sequence")
-    assert widths.loc[comparison.FAIL].iloc[4] == "1 of 11"
-
-
 def test_errors_are_means_with_their_spread_and_the_lowest_is_bold():
     runs = runs_of(ELEVEN, halved, noise=0.2)
     table = comparison.table_of_errors(comparisons.comparisons_of(runs), runs).content
@@ -142,49 +105,17 @@ def test_errors_are_means_with_their_spread_and_the_lowest_is_bold():
     assert not single[ELEVEN].map(lambda cell: "±" in cell).any(axis=None)
 
 
-def test_the_classes_of_a_narrow_figure_are_named_inside_it():
-    every = np.arange(35, dtype=np.uint8)[None]
-    frame = np.zeros((40, 120), np.uint8)
-    figure, _ = style.frame_panels(frame, width=style.COLUMN_WIDTH)
-    style.class_legend(figure, every)
-    figure.draw_without_rendering()
-    (legend,) = figure.legends
-    box = legend.get_window_extent().transformed(figure.transFigure.inverted())
-    assert 0 <= box.x0 < box.x1 <= 1 and 0 <= box.y0 < box.y1 <= 1
-
-
 def test_what_cannot_be_told_has_no_column():
     table = comparisons.comparisons_of(runs_of(ELEVEN[:2], halved, noise=0.2))
     few = comparison.table_of_ratios(comparison.all_of(table))
     assert verdicts.TOO_FEW not in few.to_string() and set(few["sequences"]) == {2}
 
 
-def test_ratios_in_the_tables_equal_the_comparison():
-    runs = runs_of(ELEVEN, halved, noise=0.2)
-    table = comparisons.comparisons_of(runs)
-    shown = comparison.table_of_ratios(comparison.all_of(table))
-    assert len(shown) == 2 * (1 + 2 * len(CONTROLS))
-    of_rmse = table[table["tested"] & (table["method"] != "baseline") & (table["metric"] == "rmse")]
-    for row in of_rmse[of_rmse["reference"] == "baseline"].itertuples():
-        cell = shown[
-            (shown["estimator"] == ESTIMATOR_TITLES[row.estimator])
-            & (shown["over"] == "all keypoints")
-            & shown["keypoints"].str.startswith(comparisons.METHOD_TITLES[row.method])
-        ]["RMSE"].iloc[0]
-        ratio, low, high = map(float, re.findall(r"[\d.]+", cell))
-        assert (ratio, low, high) == pytest.approx((row.ratio, row.low, row.high), abs=0.0051)
-    widths = comparison.table_of_widths(runs).content.set_index("sequence")
-    expected = ratios.ratios_of(best_of(runs), comparisons.of_method(runs, "baseline"), "rmse")
-    assert widths.loc[ELEVEN, "best width: RMSE"].astype(float).to_numpy() == pytest.approx(
-        expected, abs=0.0051
-    )
-    unknown = runs_of(["77"], lambda *_: 1.0)  # a sequence that the thesis does not have
-    assert np.isnan(
-        tables.table_of_change(*widths_of(unknown), NEVER_SHUFFLED, "rmse", "thesis").loc[
-            0, "change (%), thesis"
-        ]
-    )
-    assert pd.isna(tables.table_4_1(widths_of(unknown)[0], "thesis").loc[0, "width, thesis"])
+def test_a_sequence_that_the_thesis_does_not_have_has_no_number_of_it():
+    masked, all_keypoints = widths_of(runs_of(["77"], lambda *_: 1.0))
+    changes = tables.table_of_change(masked, all_keypoints, NEVER_SHUFFLED, "rmse", "thesis")
+    assert np.isnan(changes.loc[0, "change (%), thesis"])
+    assert pd.isna(tables.table_4_1(masked, "thesis").loc[0, "width, thesis"])
 
 
 @pytest.mark.parametrize(
@@ -237,19 +168,6 @@ def test_what_is_far_off_is_told_without_it():
     assert "without 03, aligned ATE is 0.5" in text
 
 
-def drawn_by_cells(runs):
-    """{name: figure} of the cells of notebook 8 that draw widths and methods."""
-    figures = {}
-    save = SimpleNamespace(save_figure=lambda figure, name, note: figures.update({name: figure}))
-    given = {"runs": runs, "SEQUENCES": sorted(runs["sequence"].unique()), "note": ""}
-    modules = {"np": np, "pd": pd, "chapter4": chapter4, "views": views, "style": style}
-    modules |= {"tables": tables, "comparisons": comparisons, "ratios": ratios}
-    names = given | modules | {"artefacts": save}
-    for number in ("58", "54", "18", "55", "56", "26", "27", "80", "82"):
-        exec(cells("08_results.ipynb", "code")[f"08-{number}"], names)
-    return figures
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "names, noise, sources",
@@ -265,7 +183,16 @@ def test_figures_of_equal_and_of_noisy_errors_can_be_drawn(names, noise, sources
     table = comparisons.comparisons_of(runs)
     if sources == ("",):
         chapter4.figure_against_width(*widths_of(runs), "rmse").draw_without_rendering()
-        figures = drawn_by_cells(runs)
+        figures = {}
+        save = SimpleNamespace(
+            save_figure=lambda figure, name, note: figures.update({name: figure})
+        )
+        given = {"runs": runs, "SEQUENCES": sorted(runs["sequence"].unique()), "note": ""}
+        modules = {"np": np, "pd": pd, "chapter4": chapter4, "views": views, "style": style}
+        modules |= {"tables": tables, "comparisons": comparisons, "ratios": ratios}
+        given |= modules | {"artefacts": save}
+        for number in ("58", "54", "18", "55", "56", "26", "27", "80", "82"):
+            exec(cells("08_results.ipynb", "code")[f"08-{number}"], given)
         assert set(figures) == {f"figure_4_{number:02d}" for number in (7, 13, 14, 15, 16)}
     figure = comparison.figure_of_ratios(table).content
     figure.draw_without_rendering()
@@ -308,28 +235,6 @@ def test_the_curve_of_few_keypoints_shows_every_ratio():
     figure = few_keypoints.figure_of_few(pd.DataFrame(near))
     enlarged = figure.axes[2::4] + figure.axes[3::4]
     assert {panel.get_ylim() for panel in enlarged} == {few_keypoints.NEAR}
-
-
-def test_the_figure_of_paths_shows_the_errors_of_all_repetitions():
-    runs = comparisons.of_method(runs_of(["00", "05"], lambda *_: 1.0), "baseline")
-    paths = {
-        (row.sequence, row.run): AHEAD + [[0, 0, 0], [0, 0, 0], [row.repetition, 0, 0], [3, 4, 0]]
-        for row in runs.itertuples()
-    }
-    figure = chapter4.figure_paths({"00": AHEAD, "05": AHEAD}, runs[::-1], paths)
-    distances = [line.get_ydata().tolist() for line in figure.axes[2].lines]
-    assert distances == [[0, 0, 0, 5], [0, 0, 1, 5], [0, 0, 2, 5]]
-
-
-def test_bars_show_the_mean_of_each_method_and_its_repetitions():
-    runs = runs_of(["00", "05"], lambda *_: 1.0, noise=0.3)
-    spread = ratios.range_over_repetitions(comparisons.of_method(runs, "baseline"), "rmse")
-    axes = drawn_by_cells(runs)["figure_4_13"].axes[0]
-    bars = next(each for each in axes.containers if isinstance(each, BarContainer))
-    assert [bar.get_height() for bar in bars] == pytest.approx(spread["mean"].tolist())
-    whiskers = bars.errorbar.lines[2][0].get_segments()
-    ends = [segment[:, 1].tolist() for segment in whiskers]
-    assert np.array(ends) == pytest.approx(spread[["lowest", "highest"]].to_numpy())
 
 
 HOSTILE = [
