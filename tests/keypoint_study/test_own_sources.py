@@ -66,16 +66,12 @@ def test_an_own_search_beside_an_estimator_with_its_own_is_refused(street, tmp_p
         Source(file, "keypoints").run(Sequence(street, "00"), settings)
 
 
-@pytest.mark.usefixtures("no_figures")
 def test_a_truth_that_fits_better_inverted_ends_a_study_and_is_told(street, capsys):
     write_kitti_poses(street / "poses/00.txt", np.linalg.inv(Street(12).poses))
     code, _ = study(street, "--masks", street.parent / "masks")
     assert code == 1 and "poses/00.txt: the truth fits better" in capsys.readouterr().err
-    for name in ("00", "01"):
-        assert main(["odometry", "--kitti", str(street), "--sequence", name]) == 0
-        assert ("the truth fits better" in capsys.readouterr().err) == (name == "00")
-    code, _ = study(street, "--masks", street.parent / "masks", "--sequences", "01")
-    assert code == 0
+    assert main(["odometry", "--kitti", str(street), "--sequence", "00"]) == 0
+    assert "the truth fits better" in capsys.readouterr().err
 
 
 @pytest.mark.real

@@ -43,20 +43,6 @@ def drive(seed=None):
     return np.array(poses)
 
 
-MOUNTING = lie.se3(rotation(2, -3, 1).as_matrix(), np.zeros(3))
-TRUE, ESTIMATED = drive(), MOUNTING @ drive(seed=0) @ MOUNTING.T
-
-
-def measured(estimated, true):
-    """Every number that there is for a path."""
-    return {
-        **{alignment: metrics.ate(estimated, true, alignment) for alignment in ("none", "sim3")},
-        **metrics.errors(estimated, true),
-        **metrics.step_errors(estimated, true),
-        **metrics.kitti_errors(estimated, true),
-    }
-
-
 def angle(matrix):
     return abs(lie.so3_log_angle(matrix[:3, :3], degrees=True))
 
@@ -136,14 +122,22 @@ def of_kitti(estimated, true):
     return dict(zip(("t_rel", "r_rel"), np.mean(errors, axis=0)))
 
 
-def by_hand(estimated, true):
-    """The numbers of `measured`, from their definitions, one pose after the other."""
+def test_every_error_of_a_kilometre_is_that_worked_out_by_hand():
+    """From their definitions, one pose after the other."""
+    mounting = lie.se3(rotation(2, -3, 1).as_matrix(), np.zeros(3))
+    true, estimated = drive(), mounting @ drive(seed=0) @ mounting.T
+    errors = {
+        **{alignment: metrics.ate(estimated, true, alignment) for alignment in ("none", "sim3")},
+        **metrics.errors(estimated, true),
+        **metrics.step_errors(estimated, true),
+        **metrics.kitti_errors(estimated, true),
+    }
     off = np.array(
         [(b - estimated[1] - a + true[1])[:3, 3] for a, b in zip(true[1:], estimated[1:])]
     )
     ape = evo.APE(evo.PoseRelation.translation_part)
     ape.process_data([PosePath3D(poses_se3=[*poses]) for poses in (true, estimated)])
-    return {
+    by_hand = {
         "none": ape.get_statistic(evo.StatisticsType.rmse),
         "sim3": aligned(estimated, true, True),
         "rmse": np.mean(np.linalg.norm(off, axis=1) ** 2) ** 0.5,
@@ -154,12 +148,8 @@ def by_hand(estimated, true):
         "lost": 0,
         **of_kitti(estimated, true),
     }
-
-
-def test_every_error_of_a_kilometre_is_that_worked_out_by_hand():
-    errors = measured(ESTIMATED, TRUE)
-    assert errors == pytest.approx(by_hand(ESTIMATED, TRUE), rel=1e-5)
-    assert np.linalg.norm(metrics.shifted(ESTIMATED, TRUE)[1] - TRUE[1], axis=0)[3] < 1e-12
+    assert errors == pytest.approx(by_hand, rel=1e-5)
+    assert np.linalg.norm(metrics.shifted(estimated, true)[1] - true[1], axis=0)[3] < 1e-12
 
 
 def test_a_rotation_between_two_cameras_is_no_reflection():

@@ -134,7 +134,13 @@ def test_other_inputs_are_served_as_opencv_does_or_refused():
     current, previous = scene(np.random.default_rng(5), 100)
     stacked = [np.float32(side).reshape(-1, 1, 2) for side in (current, previous)]
     assert assert_same_bits(*stacked)
-    for options in ({"focal": 700.0}, {"pp": (600.0, 180.0)}, {"method": cv2.LMEDS}):
+    camera = np.diag([700.0, 700, 1])  # cv2 takes one in the place of the focal length
+    for options in (
+        {"focal": 700.0},
+        {"focal": camera},
+        {"pp": (600.0, 180.0)},
+        {"method": cv2.LMEDS},
+    ):
         with pytest.raises(ValueError, match="normalised"):
             find_essential_matrix(current, previous, **options)
 

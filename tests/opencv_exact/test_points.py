@@ -90,9 +90,3 @@ def test_arrays_of_a_graphics_card_are_refused_by_name():
     ):
         with pytest.raises(ValueError, match="UMat"):
             call()
-
-
-def test_a_camera_matrix_in_the_place_of_a_focal_length_is_refused():
-    camera = np.array([[700.0, 0, 600], [0, 700, 180], [0, 0, 1]])
-    with pytest.raises(ValueError, match="normalised coordinates"):
-        find_essential_matrix(NEW, OLD, camera, cv2.RANSAC, 0.999, 1.0)

@@ -142,7 +142,7 @@ def test_a_ratio_has_two_digits_and_a_mark_if_its_interval_excludes_1(low, high,
 )
 @pytest.mark.parametrize("sources", [("",), ("net", "hand")])
 def test_findings_follow_the_verdict(errors, names, verdict, sources):
-    runs = runs_of(names, errors, noise=0.02, sources=sources)
+    runs = runs_of(names, errors, (10,), noise=0.02, sources=sources, repetitions=1)
     table = comparisons.comparisons_of(runs)
     is_primary = (
         table["decides"] & (table["method"] == "masked") & (table["reference"] == "baseline")
