@@ -4,14 +4,14 @@ A few lines of use::
 
     import thesis_repro as tr
 
-    drive = tr.Sequence("world/kitti", 0)  # tr.Sequence.from_arrays: frames in memory
+    sequence = tr.Sequence("world/kitti", 0)  # tr.Sequence.from_arrays: frames in memory
     runs = {
         "all": (tr.THESIS, None),
-        "masks": (tr.THESIS, tr.LabelMasks("labels", drive, 10)),
+        "masks": (tr.THESIS, tr.LabelMasks("labels", sequence, 10)),
         "few": (tr.OdometrySettings(detector=tr.spread(200), estimator=tr.refined), None),
     }
-    for name, result in tr.run_many(drive, runs).items():  # tr.run: a single run
-        print(name, tr.metrics.rmse(result.poses, drive.poses), result)
+    for name, result in tr.run_many(sequence, runs).items():  # tr.run: a single run
+        print(name, tr.metrics.rmse(result.poses, sequence.poses), result)
         result.write_kitti(f"{name}.txt")
 
 Detectors: spread, filled, filtered, orb; without one, Shi-Tomasi as in the thesis. Odometry takes
