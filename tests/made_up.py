@@ -46,7 +46,7 @@ def runs(
     return pd.DataFrame(rows).astype({"dilation_width": float})
 
 
-def winding(count=160, seed=None, stretch=1.0):
+def winding(count=160, seed=None):
     """Poses of a path with rotations about all axes and steps of one metre.
 
     With a seed, steps have noise.
@@ -60,5 +60,5 @@ def winding(count=160, seed=None, stretch=1.0):
         rotation = Rotation.from_rotvec(turn).as_matrix()
         poses[index] = poses[index - 1]
         poses[index, :3, :3] = poses[index - 1, :3, :3] @ rotation
-        poses[index, :3, 3] += stretch * poses[index, :3, 2] + noise * random.normal(0, 0.05, 3)
+        poses[index, :3, 3] += poses[index, :3, 2] + noise * random.normal(0, 0.05, 3)
     return poses
