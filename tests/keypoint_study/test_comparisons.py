@@ -72,6 +72,23 @@ def test_a_missing_or_zero_error_leaves_its_sequence_out(bad):
     assert np.isnan(ratios.typical_ratio([np.nan])["ratio"])
 
 
+@pytest.mark.parametrize(
+    "factor, verdict",
+    [
+        (0.5, "lower"),
+        (2.0, "higher"),
+        (1.0, "no clear difference"),
+        (lambda name: 2.0 ** (int(name) % 2 * 2 - 1), "no clear difference"),
+    ],
+)
+def test_the_verdict_follows_the_interval(factor, verdict):
+    masked, baseline = arms(runs_of({"masked": factor}), "masked", "baseline")
+    for last, word in (("06", verdict), ("05", "too few sequences to tell")):
+        runs = pd.concat([masked, baseline])
+        row = primary(comparisons.comparisons_of(runs[runs["sequence"] < last])).iloc[0]
+        assert (row["n"], row["verdict"]) == (int(last), word)
+
+
 @pytest.mark.torture
 def test_intervals_that_exclude_the_true_ratio_by_chance():
     """Print the percentages of docs/reading-results.md.

@@ -144,29 +144,23 @@ def labelled(tiny_kitti, tmp_path):
     return sequence, folder
 
 
-def test_label_masks_and_written_masks_equal_the_filter(labelled, tmp_path):
+def test_label_masks_and_written_masks_equal_the_filter_of_the_label_maps_there_now(
+    labelled, tmp_path
+):
     sequence, folder = labelled
     corrections = MaskSettings("exact", symmetric=True, classes=("sky",), movable=1, margin=3)
-    for settings in (corrections, MaskSettings()):  # the second replaces the first
+    for settings in (corrections, MaskSettings()):
         made = folders.LabelMasks(folder, sequence, 4, settings)
-        expected = masks.keypoint_mask(bands("road", "sky"), (48, 64), 4, settings)
-        folders.write_masks(made, tmp_path / "masks")
-        assert len(made) == 4 and np.array_equal(made[3], expected)
-        assert "4 masks of 64x48 pixels, dilation width 4" in repr(made)
-        assert np.array_equal(folders.MaskFolder(tmp_path / "masks", sequence)[1], expected)
-
-
-def test_label_maps_written_again_give_new_masks(labelled, tmp_path):
-    sequence, folder = labelled
-    made = folders.LabelMasks(folder, sequence, 4)
-    for names in (("road", "sky"), ("sky", "road", "sky"), ("road", "sky", "car")):
-        for path in made.paths:
-            cv2.imwrite(str(path), bands(*names))
-        expected = masks.keypoint_mask(bands(*names), (48, 64), 4)
-        assert all(np.array_equal(made[index], expected) for index in range(4))
-        folders.write_masks(made, tmp_path / "masks")
-        written = folders.MaskFolder(tmp_path / "masks", sequence)
-        assert all(np.array_equal(written[index], expected) for index in range(4))
+        assert len(made) == 4 and "4 masks of 64x48 pixels, dilation width 4" in repr(made)
+        for names in (("road", "sky"), ("sky", "road", "sky"), ("road", "sky", "car")):
+            for path in made.paths:
+                cv2.imwrite(str(path), bands(*names))
+            expected = masks.keypoint_mask(bands(*names), (48, 64), 4, settings)
+            folders.write_masks(made, tmp_path / "masks")  # in the place of those before
+            written = folders.MaskFolder(tmp_path / "masks", sequence)
+            for index in range(4):
+                assert np.array_equal(made[index], expected)
+                assert np.array_equal(written[index], expected)
 
 
 def test_a_mask_named_as_a_frame_is_that_frames(tiny_kitti, tmp_path):
