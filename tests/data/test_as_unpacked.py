@@ -5,10 +5,18 @@ alone.
 """
 
 import json
+import shutil
 
 import cv2
 import numpy as np
 import pytest
+from as_downloaded import (
+    T_BS,
+    write_euroc,
+    write_euroc_truth,
+    write_images,
+    write_tum_frames,
+)
 from evo.core.metrics import PoseRelation
 from evo.core.sync import associate_trajectories
 from evo.core.trajectory import PoseTrajectory3D
@@ -18,7 +26,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from street import Street
 
 from thesis_repro.command.cli import main
-from thesis_repro.data import trajectories
+from thesis_repro.data import layout, trajectories
 from thesis_repro.data.sequence import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.masks.folders import LabelMasks, MaskFolder
@@ -29,14 +37,6 @@ LENSES = {
     "euroc": [-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05],
     "tum": [0.2624, -0.9531, -0.0054, 0.0026, 1.1633],
 }
-T_BS = np.array(  # of EuRoC's left camera
-    [
-        [0.0148655429818, -0.999880929698, 0.00414029679422, -0.0216401454975],
-        [0.999557249008, 0.0149672133247, 0.025715529948, -0.064676986768],
-        [-0.0257744366974, 0.00375618835797, 0.999660727178, 0.00981073058949],
-        [0.0, 0.0, 0.0, 1.0],
-    ]
-)
 START_NS = 1403715273262142976
 
 
@@ -70,40 +70,17 @@ def drives(tmp_path_factory):
     true = world @ street.poses
     # EuRoC: 20 frames a second, 200 poses of the body, which begin later and end earlier
     stamps = START_NS + 50_000_000 * np.arange(COUNT)
-    data = root / "MH_01/mav0/cam0/data"
-    data.mkdir(parents=True)
-    for stamp, image in zip(stamps, street.images):
-        cv2.imwrite(str(data / f"{stamp}.png"), seen_through(image, camera, LENSES["euroc"]))
-    lines = "".join(f"{stamp},{stamp}.png\r\n" for stamp in stamps)
-    (data.parent / "data.csv").write_text(f"#timestamp [ns],filename\r\n{lines}")
-    (data.parent / "sensor.yaml").write_text(
-        f"sensor_type: camera\nT_BS:\n  cols: 4\n  rows: 4\n  data: {T_BS.ravel().tolist()}\n"
-        f"rate_hz: 20\nresolution: [480, 160]\ncamera_model: pinhole\n"
-        f"intrinsics: [{fx}, {fy}, {cx}, {cy}] #fu, fv, cu, cv\n"
-        "distortion_model: radial-tangential\n"
-        f"distortion_coefficients: {LENSES['euroc']}\n"
-    )
-    seconds = 0.05 * np.arange(COUNT)
+    images = [seen_through(image, camera, LENSES["euroc"]) for image in street.images]
+    write_euroc(root / "MH_01", images, camera, stamps, LENSES["euroc"])
     at = np.arange(0.1021, 1.3, 0.005)
-    body = between(true @ np.linalg.inv(T_BS), seconds, at)
-    quaternions = Rotation.from_matrix(body[:, :3, :3]).as_quat()[:, [3, 0, 1, 2]]
-    rows = [
-        f"{START_NS + round(1e9 * time)}," + ",".join(f"{number:.6f}" for number in numbers)
-        for time, numbers in zip(at, np.column_stack([body[:, :3, 3], quaternions]))
-    ]
-    truth = root / "MH_01/mav0/state_groundtruth_estimate0/data.csv"
-    truth.parent.mkdir()
-    truth.write_text("\n".join(["#timestamp, p_RS_R_x [m], p_RS_R_y [m]", *rows, ""]))
+    body = between(true @ np.linalg.inv(T_BS), 0.05 * np.arange(COUNT), at)
+    truth = layout.poses(root / "MH_01")
+    write_euroc_truth(truth, body, [START_NS + round(1e9 * time) for time in at])
     # TUM: 30 frames a second, 100 poses of the camera, with two gaps of 0.11 s
     folder = root / "rgbd_dataset_freiburg1_street"
-    (folder / "rgb").mkdir(parents=True)
     seconds = 1305031102.175304 + np.arange(COUNT) / 30
-    listed = []
-    for second, image in zip(seconds, street.images):
-        listed.append(f"{second:.6f} rgb/{second:.6f}.png\n")
-        pixels = seen_through(image, camera, LENSES["tum"])
-        cv2.imwrite(str(folder / listed[-1].split()[1]), cv2.merge([pixels] * 3))
-    (folder / "rgb.txt").write_text("# color images\n# file: 'x.bag'\n" + "".join(listed))
+    images = [seen_through(image, camera, LENSES["tum"]) for image in street.images]
+    write_tum_frames(folder, [cv2.merge([image] * 3) for image in images], seconds)
     at = np.arange(seconds[0] + 0.0042, seconds[-1], 0.01)
     for gap in seconds[[11, 20]] + 0.003:
         at = at[np.abs(at - gap) > 0.05]
@@ -115,7 +92,7 @@ def drives(tmp_path_factory):
         "tum": (
             folder,
             ["--calibration", str(root / "tum.txt")],
-            np.array([float(line.split()[0]) for line in listed]),
+            np.array([float(f"{second:.6f}") for second in seconds]),
             folder / "groundtruth.txt",
         ),
     }
@@ -123,12 +100,11 @@ def drives(tmp_path_factory):
 
 def by_evo(name, times, truth):
     """True poses of the camera at the times of frames that have one, as evo has them."""
-    read = file_interface.read_tum_trajectory_file
     if name == "euroc":
-        read = file_interface.read_euroc_csv_trajectory
-    poses = read(str(truth))
-    if name == "euroc":
+        poses = file_interface.read_euroc_csv_trajectory(str(truth))
         poses.transform(T_BS, right_mul=True)
+    else:
+        poses = file_interface.read_tum_trajectory_file(str(truth))
     still = np.zeros((len(times), 3)), np.tile([1.0, 0, 0, 0], (len(times), 1))
     frames, poses = associate_trajectories(PoseTrajectory3D(*still, times), poses, max_diff=0.01)
     return frames.timestamps, np.array(poses.poses_se3)
@@ -172,28 +148,27 @@ def test_poses_and_errors_are_those_of_evo(drives, name, missing, tmp_path, caps
     assert error < 0.2  # of eleven metres
 
 
-def test_a_pose_is_nearest_also_where_the_truth_is_short(drives, tmp_path):
-    """Fewer poses than frames, but closer together: evo alone gives a frame the first of them."""
-    times = np.arange(40) / 30
-    at = np.concatenate([np.arange(0, 0.05, 0.004), [1.3]])
+@pytest.mark.parametrize(
+    "times, at, indices, found",
+    [
+        # fewer poses than frames, but closer together: evo alone gives a frame the first of them
+        (np.arange(40) / 30, [*np.arange(0, 0.05, 0.004), 1.3], [0, 1, 39], [0, 0.032, 1.3]),
+        (np.arange(1, 5), np.arange(3.0), [0, 1], [1, 2]),  # in whole seconds
+    ],
+)
+def test_each_frame_has_the_nearest_pose(tmp_path, times, at, indices, found):
     poses = np.tile(np.eye(4), (len(at), 1, 1))
     poses[:, 2, 3] = at
-    trajectories.write_tum(tmp_path / "short.txt", poses, at)
-    indices, found = trajectories.read_poses_at(tmp_path / "short.txt", times)
-    assert indices.tolist() == [0, 1, 39]
-    np.testing.assert_allclose(found[:, 2, 3], [0, 0.032, 1.3])
+    trajectories.write_tum(tmp_path / "short.txt", poses, np.array(at))
+    read, nearest = trajectories.read_poses_at(tmp_path / "short.txt", times)
+    assert read.tolist() == indices
+    np.testing.assert_allclose(nearest[:, 2, 3], found)
 
 
 @pytest.fixture
 def euroc(drives, tmp_path):
     """A copy of EuRoC's drive that a test may change."""
-    folder = tmp_path / "MH_01"
-    for path in drives["euroc"][0].rglob("*.*"):
-        if path.is_file():
-            copy = folder / path.relative_to(drives["euroc"][0])
-            copy.parent.mkdir(parents=True, exist_ok=True)
-            copy.write_bytes(path.read_bytes())
-    return folder
+    return shutil.copytree(drives["euroc"][0], tmp_path / "MH_01")
 
 
 def test_another_calibration_leaves_the_body_as_it_is(euroc, tmp_path, caplog):
@@ -254,13 +229,10 @@ def test_masks_and_label_maps_belong_to_frames_without_distortion(
     sequence = Sequence(None, euroc).subset(4)
     one = np.full(sequence.size, 255, np.uint8)
     one[:40] = 0
-    for path, frame in zip(sequence.frame_paths, sequence):
-        (tmp_path / "each").mkdir(exist_ok=True)
-        cv2.imwrite(str(tmp_path / "each" / path.name), np.where(frame > 20, one, 0))
-        (tmp_path / "straight").mkdir(exist_ok=True)
-        cv2.imwrite(str(tmp_path / "straight" / path.name), frame)
-    (tmp_path / "one").mkdir()
-    cv2.imwrite(str(tmp_path / "one/bonnet.png"), one)
+    masks = [np.where(frame > 20, one, 0) for frame in sequence]
+    write_images(tmp_path / "each", sequence.label_names, masks)
+    write_images(tmp_path / "straight", sequence.label_names, sequence)
+    write_images(tmp_path / "one", ["bonnet.png"], [one])
     assert np.array_equal(
         MaskFolder(tmp_path / "each", sequence)[1] > 0, (sequence[1] > 20) & (one > 0)
     )

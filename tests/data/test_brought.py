@@ -6,6 +6,7 @@ import shutil
 import cv2
 import numpy as np
 import pytest
+from as_downloaded import write_euroc_truth
 
 from thesis_repro import odometry
 from thesis_repro.command.cli import main
@@ -13,7 +14,7 @@ from thesis_repro.data import cameras, kitti
 from thesis_repro.data.cityscapes import read_image, resize_bilinear
 from thesis_repro.data.frames import white_level
 from thesis_repro.data.sequence import Sequence
-from thesis_repro.data.trajectories import read_poses, read_poses_at, write_tum
+from thesis_repro.data.trajectories import read_poses, write_tum
 from thesis_repro.errors import InputError
 from thesis_repro.masks import folders
 
@@ -73,15 +74,12 @@ def test_poses_in_the_folder_of_a_sequence(tiny_kitti):
     (tiny_kitti / "poses/00.txt").rename(folder / "poses.txt")
     assert kitti.sequences(tiny_kitti) == ["mine"]
     for root, name in ((tiny_kitti, "mine"), (None, folder)):
-        assert np.array_equal(Sequence(root, name).poses, expected)
+        sequence = Sequence(root, name)
+        assert sequence.name == "mine" and np.array_equal(sequence.poses, expected)
 
 
 def euroc(path, poses, times):
-    """Write the ground truth of EuRoC: nanoseconds, and quaternions with w first."""
-    write_tum(path, poses, times)
-    rows = np.loadtxt(path)[:, [0, 1, 2, 3, 7, 4, 5, 6]]
-    rows = np.column_stack([np.round(rows[:, 0] * 1e9), rows[:, 1:], np.zeros((len(rows), 9))])
-    path.write_text("#timestamp, p_RS_R_x [m], ...\n" + lines(rows).replace(" ", ","))
+    write_euroc_truth(path, poses, np.round(1e9 * times))
 
 
 @pytest.mark.parametrize("name, write", [("truth.txt", write_tum), ("data.csv", euroc)])
@@ -358,17 +356,15 @@ def objects(*values):
     [(1, 2, 3), (255, 1, 40), (1001, 2002, 10000), [(0, 0, 1), (0, 128, 0), (128, 128, 0)]],
 )
 def test_inverted_masks_leave_out_every_object(tiny_kitti, tmp_path, values):
-    frames = Sequence(tiny_kitti, "00")
-    cv2.imwrite(str(tmp_path / "objects.png"), objects(*values))
-    expected = np.where(objects(1, 1, 1), 0, 255)
-    masks = folders.MaskFolder(tmp_path / "objects.png", frames, invert=True)
-    assert np.array_equal(masks[2], expected)
+    path = tmp_path / "objects.png"
+    cv2.imwrite(str(path), objects(*values))
+    masks = folders.MaskFolder(path, Sequence(tiny_kitti, "00"), invert=True)
+    assert np.array_equal(masks[2], np.where(objects(1, 1, 1), 0, 255))
 
 
 def test_soft_masks_have_one_limit_for_all_frames(tmp_path):
-    soft = cv2.GaussianBlur(BINARY, (9, 9), 1)
     for brightness in (1, 0.92):
-        darker = (brightness * soft).astype(np.uint8)
+        darker = (brightness * cv2.GaussianBlur(BINARY, (9, 9), 1)).astype(np.uint8)
         cv2.imwrite(str(tmp_path / "a.png"), darker)
         assert np.array_equal(folders.read_mask(tmp_path / "a.png") > 0, darker > 127)
 
@@ -444,11 +440,3 @@ def test_names_and_numbers_that_cannot_be_are_one_line(own, options, said, monke
     (line,) = capsys.readouterr().err.splitlines()
     assert re.match(f"error: .*{said}", line)
     assert not (own.parent / "path.txt").exists()
-
-
-def test_times_of_frames_in_whole_seconds(tmp_path):
-    written = np.tile(np.eye(4), (3, 1, 1))
-    write_tum(tmp_path / "poses.txt", written, np.arange(3.0))
-    frames, poses = read_poses_at(tmp_path / "poses.txt", np.arange(1, 5))
-    assert list(frames) == [0, 1]  # at seconds 1 and 2
-    np.testing.assert_array_equal(poses, written[1:])
