@@ -239,13 +239,6 @@ def test_the_tested_width_is_the_width_of_the_controls():
     assert comparisons.tested_width(pd.concat([narrow, runs_of({"mirrored": 1.0}, width=7)])) == 10
 
 
-def test_sequences_far_off_the_mean_are_named():
-    runs = runs_of({"masked": lambda name: {"03": 6.0, "05": 0.1}.get(name, 1.0)})
-    rows = comparisons.comparisons_of(runs)
-    far_off = rows.loc[rows["method"] == "masked", "far_off"]
-    assert set(far_off.map(tuple)) == {("03", "05")}
-
-
 def parts_of(
     error, sequences=(*EIGHT, "08", "09", "10"), widths=range(1, 16), repetitions=5, noise=0.0
 ):

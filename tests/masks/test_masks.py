@@ -156,6 +156,7 @@ def test_label_masks_and_written_masks_equal_the_filter_of_the_label_maps_there_
             for path in made.paths:
                 cv2.imwrite(str(path), bands(*names))
             expected = masks.keypoint_mask(bands(*names), (48, 64), 4, settings)
+            assert np.array_equal(made[3], expected)  # it was read last before
             folders.write_masks(made, tmp_path / "masks")  # in the place of those before
             written = folders.MaskFolder(tmp_path / "masks", sequence)
             for index in range(4):
