@@ -27,7 +27,7 @@ comma := ,
 ifneq ($(findstring $(comma),$(OMP_NUM_THREADS)),)
 export OMP_NUM_THREADS := $(firstword $(subst $(comma), ,$(OMP_NUM_THREADS)))
 endif
-unexport PYTHONHOME PYTHONDONTWRITEBYTECODE PYTHONSTARTUP JUPYTER_PATH CDPATH TF_USE_LEGACY_KERAS XLA_FLAGS TF_XLA_FLAGS
+unexport PYTHONHOME PYTHONDONTWRITEBYTECODE PYTHONSTARTUP JUPYTER_PATH CDPATH TF_USE_LEGACY_KERAS XLA_FLAGS TF_XLA_FLAGS MPLBACKEND
 
 .PHONY: help setup figures notebooks test lint lab book check-data excerpts evidence timings torture bench clean
 help:

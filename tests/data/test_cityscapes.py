@@ -1,7 +1,10 @@
 """Pairs of images and label maps."""
 
+import os
 import zlib
+from types import SimpleNamespace
 
+import cells
 import cv2
 import numpy as np
 import pytest
@@ -43,6 +46,32 @@ def test_both_layouts_give_the_same_pairs(tiny_cityscapes, tmp_path):
         "street_2",
     ]
     assert len(cityscapes.pairs(official, "train", limit=99)) == 4
+
+
+def listed_by_lesson(root, split):
+    """The images and label maps that notebook 1 lists."""
+    names = {"os": os, "settings": SimpleNamespace(cityscapes=root)}
+    for text in cells.cells(cells.named("01"), "code").values():
+        if text.startswith(("def folders", "def listed")):
+            exec(text, names)
+    return names["listed"](split)
+
+
+def test_what_a_mac_leaves_and_a_licence_are_no_data(tiny_cityscapes):
+    """The package and notebook 1 list the same files."""
+    town = {name: tiny_cityscapes / name / "train" / "town" for name in ("leftImg8bit", "gtFine")}
+    for name, source in (("leftImg8bit", "train"), ("gtFine", "trainannot")):
+        ending = "gtFine_labelIds" if name == "gtFine" else name
+        town[name].mkdir(parents=True)
+        for path in (tiny_cityscapes / source).iterdir():
+            path.rename(town[name] / f"{path.stem}_{ending}.png")
+        for path in [*town[name].iterdir()]:
+            path.with_name(f"._{path.name}").write_bytes(b"copy")
+        for extra in (".DS_Store", "license.txt", "town/.DS_Store"):
+            (town[name].parent / extra).write_bytes(b"no data")
+    pairs = cityscapes.pairs(tiny_cityscapes, "train")
+    listed = [[str(path) for path in paths] for paths in zip(*(pair[1:] for pair in pairs))]
+    assert len(pairs) == 4 and listed == [*listed_by_lesson(tiny_cityscapes, "train")]
 
 
 def test_images_are_read_in_colour_or_gray(tiny_cityscapes):

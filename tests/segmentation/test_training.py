@@ -231,7 +231,7 @@ def test_one_core_and_all_give_the_same_bits(digest):
         "import os; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))}); "
         "import small_training; print(small_training.digest())"
     )
-    another_keras = {"TF_USE_LEGACY_KERAS": 1, "KERAS_BACKEND": "jax"}
+    another_keras = {"TF_USE_LEGACY_KERAS": 1, "KERAS_BACKEND": "jax", "SM_FRAMEWORK": "keras"}
     one_core = succeed([sys.executable, "-c", code], Path(__file__).parent, **another_keras)
     assert one_core.stdout.split()[-1] == digest
 

@@ -32,7 +32,6 @@ if platform.machine() in ("x86_64", "AMD64"):
 OTHER_VARIABLES = {
     "TF_CPP_MIN_LOG_LEVEL": "3",  # errors of TensorFlow are Python exceptions as well
     "TF_FORCE_GPU_ALLOW_GROWTH": "true",  # do not take all memory of a GPU at the start
-    "SM_FRAMEWORK": "tf.keras",  # of segmentation-models
     "NO_ALBUMENTATIONS_UPDATE": "1",  # the search for a newer release needs a network
 }
 
@@ -46,6 +45,7 @@ for _name, _value in _variables.items():
     os.environ.setdefault(_name, _value)
 os.environ["KERAS_BACKEND"] = "tensorflow"  # the package calls TensorFlow itself
 os.environ["TF_USE_LEGACY_KERAS"] = "0"  # and Keras 3
+os.environ["SM_FRAMEWORK"] = "tf.keras"  # the only one of segmentation-models that works with it
 
 # code that makes label maps and trainings
 CODE = ("thesis_repro/segmentation", "thesis_repro/data", "thesis_repro/running/files.py")
