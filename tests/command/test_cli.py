@@ -15,6 +15,7 @@ import pytest
 import trials
 
 import thesis_repro as tr
+import write_texts
 from keypoint_study import sources
 from thesis_repro.command import cli
 from thesis_repro.command.options import build_parser
@@ -32,7 +33,7 @@ def run(command, *words):
 
 
 PARSER = build_parser(cli.COMMANDS)
-COMMANDS = next(action for action in PARSER._actions if action.dest == "command").choices
+COMMANDS = write_texts.commands()
 
 
 def test_a_source_given_as_a_link_keeps_the_typed_name(tmp_path):
@@ -150,21 +151,13 @@ def test_written_masks_give_the_same_path_as_label_maps(small_world, small_label
 
 
 def test_the_odometry_writes_poses_and_prints_a_summary(small_world, tmp_path, capsys):
-    poses, tum, kitti = tmp_path / "poses.txt", tmp_path / "path.tum", small_world / "kitti"
-    command = ["odometry", "--kitti", kitti, "--sequence", "00", "--json", "--frames", 8]
-    keypoints = []
-    for options in (
-        [],
-        ["--labels", kitti / "sequences/00/labels_0", "--dilation", 3],
-        ["--max-keypoints", 50],
-    ):
-        assert run(*command, "--output", poses, "--tum", tum, *options) == 0
-        out, err = capsys.readouterr()
-        summary = json.loads(out)
-        assert summary["frames"] == len(read_poses(poses)) == 8 and summary["rmse_m"] > 0
-        assert str(poses) in err and str(tum) in err
-        keypoints.append(summary["mean_keypoints"])
-    assert keypoints[0] > keypoints[1] and keypoints[2] == 50
+    poses, tum = tmp_path / "poses.txt", tmp_path / "path.tum"
+    where = ["--kitti", small_world / "kitti", "--sequence", "00", "--frames", 8, "--json"]
+    assert run("odometry", *where, "--output", poses, "--tum", tum) == 0
+    out, err = capsys.readouterr()
+    summary = json.loads(out)
+    assert summary["frames"] == len(read_poses(poses)) == 8 and summary["rmse_m"] > 0
+    assert str(poses) in err and str(tum) in err
     assert len(tum.read_text().splitlines()) == 8
 
 
@@ -212,6 +205,7 @@ def test_options_of_the_odometry(tiny_kitti, tmp_path, capsys):
         [0],
         [0, "--truth", tmp_path / "truth.txt"],
         [0, "--spread", 20],
+        [0, "--max-keypoints", 20],
         [0, "--calibration", tmp_path / "camera.txt"],
         [2],
     ):
@@ -219,9 +213,10 @@ def test_options_of_the_odometry(tiny_kitti, tmp_path, capsys):
         out, err = capsys.readouterr()
         assert ("4 of 4 steps" in err or "3 of 4 steps" in err) == (options == [2])
         summaries.append(json.loads(out))
-    plain, true, spread, undistorted, _ = summaries
+    plain, true, spread, strongest, undistorted, _ = summaries
     assert plain["rmse_m"] is None and true["rmse_m"] > 0
     assert 10 < spread["mean_keypoints"] <= 20 < plain["mean_keypoints"]
+    assert strongest["mean_keypoints"] == 20
     assert undistorted["mean_keypoints"] != plain["mean_keypoints"]
 
 
@@ -249,9 +244,7 @@ def test_a_new_kind_of_mask_is_one_entry(monkeypatch, tiny_kitti, tmp_path):
         return mask
 
     monkeypatch.setitem(KINDS, "left", Kind(left, "on the left", has_width=False))
-    parser = build_parser(cli.COMMANDS, ["study"])
-    (study,) = [each.choices["study"] for each in parser._actions if each.dest == "command"]
-    assert "on the left" in study.format_help()
+    assert "on the left" in write_texts.commands()["study"].format_help()
     for index in range(4):
         write_png(tmp_path / f"maps/{index:06d}.png", MAP)
     where = ["--kitti", tiny_kitti, "--sequence", "00", "--labels", tmp_path / "maps"]

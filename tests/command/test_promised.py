@@ -6,11 +6,10 @@ import pandas as pd
 import trials
 
 import thesis_repro as tr
+import write_texts
 from keypoint_study import comparisons, jobs, runner
 from keypoint_study.report import comparison
 from keypoint_study.sources import Source
-from thesis_repro.command import cli
-from thesis_repro.command.options import build_parser
 
 RECORD = Path(__file__).with_name("promised.txt")
 RUNS = trials.ROOT / "tests" / "keypoint_study" / "runs.csv"
@@ -31,10 +30,8 @@ def recorded():
 
 
 def options():
-    parser = build_parser(cli.COMMANDS)
-    (commands,) = [action.choices for action in parser._actions if action.dest == "command"]
     groups = {}
-    for name, each in commands.items():
+    for name, each in write_texts.commands().items():
         words = [action.option_strings or [action.metavar] for action in each._actions]
         groups[name] = {word for strings in words for word in strings} - {"-h", "--help"}
     return groups

@@ -14,13 +14,13 @@ from thesis_repro.command.options import MASK_OPTIONS, build_parser
 from thesis_repro.errors import InputError, one_line
 from thesis_repro.running import program
 
-# options that name an output file: its content, and the endings that its name may have (none given:
-# any)
-OUTPUT_FILES: dict[str, tuple[str, tuple[str, ...]]] = {
-    "output": ("poses in KITTI format", ()),
-    "tum": ("poses in TUM format", ()),
-    "plot": ("figure of the paths", (".png", ".svg", ".pdf", ".jpg")),
+# options that name an output file: its content
+OUTPUT_FILES = {
+    "output": "poses in KITTI format",
+    "tum": "poses in TUM format",
+    "plot": "figure of the paths",
 }
+PLOTS = (".png", ".svg", ".pdf", ".jpg")  # endings of a figure's name
 
 
 # The commands, see COMMANDS. Their docstrings are shown by --help. Each imports its libraries
@@ -132,7 +132,7 @@ def odometry(options: Any) -> None:
         _draw_path(result, sequence, options.plot)
     print(json.dumps(record) if options.json else _text(record, sequence, options.speed))
     for name, path in _output_files(options).items():
-        program.log.info(f"{path}: {OUTPUT_FILES[name][0]}")
+        program.log.info(f"{path}: {OUTPUT_FILES[name]}")
 
 
 def study(options: Any) -> int:
@@ -154,10 +154,9 @@ def study(options: Any) -> int:
         raise InputError("--widths: only masks from label maps (--labels) have a width")
     if options.invert and "masks" not in kinds:
         raise InputError("--invert: needs --masks DIR")
-    widths: set[int] = set()
-    if has_labels:
-        all_widths = WIDTHS if mask_settings.has_width else ()
-        widths = widths.union(*options.widths or [all_widths])
+    widths = {width for listed in options.widths for width in listed}
+    if has_labels and mask_settings.has_width and not widths:
+        widths = {*WIDTHS}
     names = dict.fromkeys(layout.locate(options.kitti, name).name for name in options.sequences)
     detector = _detector(options)
     planned = Study(
@@ -328,7 +327,7 @@ def _image_folders(root: Path, calibration: Path | None = None) -> list[tuple[Pa
     return found
 
 
-def _mask_settings(options: Any, has_labels: bool = True) -> Any:
+def _mask_settings(options: Any, has_labels: bool) -> Any:
     from thesis_repro.data.label_ids import LABEL_IDS
     from thesis_repro.masks import MaskSettings
 
@@ -377,10 +376,9 @@ def _check_outputs(options: Any, *inputs: Path | None) -> None:
     """
     data = [path.resolve() for path in (vars(options).get("kitti"), *inputs) if path]
     outputs = _output_files(options)
-    for name, path in outputs.items():
-        endings = OUTPUT_FILES[name][1]
-        if endings and path.suffix.lower() not in endings:
-            raise InputError(f"--{name} {path}: its name must end in {' or '.join(endings)}")
+    plot = outputs.get("plot")
+    if plot and plot.suffix.lower() not in PLOTS:
+        raise InputError(f"--plot {plot}: its name must end in {' or '.join(PLOTS)}")
     for (one, path), (other, same) in combinations(outputs.items(), 2):
         if path.resolve() == same.resolve():
             raise InputError(f"--{one}, --{other}: both are {same}; give each a name of its own")

@@ -151,6 +151,9 @@ SHARED: dict[str, dict[str, Any]] = {
         metavar="N",
         help="fill each of 16 x 5 fields of the frame to N keypoints where the mask leaves fewer",
     ),
+    "--dilation": dict(
+        type=int, metavar="W", help="dilation width, in pixels, of masks from label maps"
+    ),
     "--calibration": dict(
         type=path,
         metavar="FILE",
@@ -159,7 +162,6 @@ SHARED: dict[str, dict[str, Any]] = {
     ),
 }
 SEQUENCE = ("--kitti", "--sequence", "--camera", "--calibration", "--frames")
-DILATION = dict(type=int, metavar="W", help="dilation width, in pixels, of masks from label maps")
 
 MASK_OPTIONS: dict[str, Any] = {
     "--boundaries": _boundaries,
@@ -272,7 +274,7 @@ COMMANDS: dict[str, dict[str, Any]] = {
             metavar="DIR",
             help="a label map for each frame, or a folder of them for each sequence",
         ),
-        "--dilation": DILATION,
+        **_shared("--dilation"),
     },
     "odometry": {
         **_shared(*SEQUENCE),
@@ -308,7 +310,7 @@ COMMANDS: dict[str, dict[str, Any]] = {
             metavar="DIR",
             help="a label map for each frame, or a folder of them for each sequence; needs --dilation",
         ),
-        "--dilation": DILATION,
+        **_shared("--dilation"),
         "--estimator": _estimator,
         "--detector": _detector,
         "--max-keypoints": dict(
@@ -361,6 +363,7 @@ COMMANDS: dict[str, dict[str, Any]] = {
             type=values.list_of_widths,
             nargs="+",
             action="extend",
+            default=[],
             metavar="W,W",
             help="dilation widths of masks from label maps, in pixels, such as 5,10 (1-15)",
         ),
