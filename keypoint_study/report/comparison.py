@@ -17,7 +17,7 @@ from keypoint_study.jobs import ESTIMATOR_TITLES
 from keypoint_study.path_errors import ERRORS
 from keypoint_study.report import style, texts
 from keypoint_study.report.style import BASELINE, COLUMN_WIDTH, MASKED, PAGE_WIDTH, Artefact
-from keypoint_study.verdicts import LEVEL, MIN_SEQUENCES
+from keypoint_study.verdicts import LEVEL, MIN_SEQUENCES, TOO_FEW
 
 REACHES = (2, 4, 8, 16, 64)  # of the figure's axis, which goes from 1 / reach to reach
 SHOWN = (*comparisons.JUDGING_METRICS, "rmse")  # the last one as the thesis measures it
@@ -206,7 +206,9 @@ def table_of_ratios(rows: pd.DataFrame) -> pd.DataFrame:
             "failures": first["failures_verdict"],
         }
         lines.append(line)
-    return texts.without_untold(pd.DataFrame(lines), "verdict", "failures")
+    table = pd.DataFrame(lines)
+    untold = [name for name in ("verdict", "failures") if set(table.get(name, [])) == {TOO_FEW}]
+    return table.drop(columns=untold)
 
 
 def long_table_of_ratios(table: pd.DataFrame) -> Artefact:

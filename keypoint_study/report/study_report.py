@@ -3,7 +3,7 @@
 Figures are also written as PDF, across a page and in one column of a paper.
 """
 
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -85,7 +85,10 @@ def write(study: Study, runs: pd.DataFrame, folder: Path, warnings: Collection[s
     text_of_findings = findings_of(named, table, note, embedded)
     findings = Artefact("findings", "What the runs show", "", text_of_findings)
     shown = [html.described(findings, style.save(findings, folder, note))]
-    save_for_column(figures_of(study, runs, table, folder, COLUMN_WIDTH), folder)
+    for figure in figures_of(study, runs, table, folder, COLUMN_WIDTH):
+        # a tight box would make it wider or narrower than the column
+        style.write_figure(figure.content, folder / f"{figure.name}-column.pdf", bbox_inches=None)
+        plt.close(figure.content)
     for figure in figures_of(study, runs, table, folder, PAGE_WIDTH):
         style.write_figure(figure.content, folder / f"{figure.name}.pdf")
         files = style.save(figure, folder, note)
@@ -109,14 +112,6 @@ def write(study: Study, runs: pd.DataFrame, folder: Path, warnings: Collection[s
     )
     write_text(folder / html.PAGE, text)
     return folder / html.PAGE
-
-
-def save_for_column(figures: Iterable[Artefact], folder: Path) -> None:
-    """Write figures as PDF for one column of a paper."""
-    for figure in figures:
-        # a tight box would make it wider or narrower than the column
-        style.write_figure(figure.content, folder / f"{figure.name}-column.pdf", bbox_inches=None)
-        plt.close(figure.content)
 
 
 def figures_of(

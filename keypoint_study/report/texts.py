@@ -12,7 +12,6 @@ import pandas as pd
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from keypoint_study.ratios import side_of_one
-from keypoint_study.verdicts import TOO_FEW
 from thesis_repro.errors import one_line
 
 # behind an interval, by the side of 1 on which it lies
@@ -55,12 +54,6 @@ def short(row: Mapping[str, Any] | pd.Series) -> str:
         return typical
     mark = MARKS[side_of_one(row["low"], row["high"])]
     return f"{typical} ({number(row['low'])}-{number(row['high'])}){mark}"
-
-
-def without_untold(table: pd.DataFrame, *columns: str) -> pd.DataFrame:
-    """Return a table without those of these columns that only say that sequences are too few."""
-    untold = [name for name in columns if name in table and set(table[name]) == {TOO_FEW}]
-    return table.drop(columns=untold)
 
 
 def in_markdown(text: object) -> str:
