@@ -61,11 +61,11 @@ def sequences_folder(root: str | Path) -> Path:
     """
     root = Path(root)
     folder = root / "sequences"
-    others = LAYOUTS[:-1]
-    if not folder.is_dir() and any(
-        layout.is_mine(path) for path in root.glob("*") for layout in others
-    ):
-        return root
+    if folder.is_dir():
+        return folder
+    for layout in LAYOUTS[:-1]:
+        if any(map(layout.is_mine, root.glob("*"))):
+            return root
     return folder
 
 

@@ -97,7 +97,7 @@ def read_poses(path: str | Path) -> np.ndarray:
 
 
 def read_truth(
-    path: Path, times: np.ndarray | None, within: float = WITHIN
+    path: Path, times: np.ndarray | None, within: float
 ) -> tuple[np.ndarray | None, np.ndarray]:
     """Read a file of poses in any of the formats.
 
@@ -148,7 +148,7 @@ def read_poses_at(
         truth = read(file)
         frames, truth = associate_trajectories(frames, truth, max_diff=within)
     except SyncException:
-        ends = [f"{of[0]:.15g} to {of[-1]:.15g}" for of in (truth.timestamps, times)]
+        ends = [f"{each[0]:.15g} to {each[-1]:.15g}" for each in (truth.timestamps, times)]
         raise InputError(
             f"{path}: no pose is within {within:g} s of a frame; its poses have the times {ends[0]}, the frames "
             f"{ends[1]}, seconds"

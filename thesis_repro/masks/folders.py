@@ -240,7 +240,8 @@ def _check_lens(place: Path, sequence: Sequence, kind: str) -> None:
 
     They live in frames without distortion, as the odometry sees them.
     """
-    lens, made = getattr(sequence, "lens", Camera(np.eye(3), np.empty(0))), provenance.record(place)
+    lens = getattr(sequence, "lens", Camera(np.eye(3), np.empty(0)))
+    made = provenance.record(place)
     if made and "model" in made and made.get("camera", []) != lens.record():
         raise InputError(
             f"{place}: made of frames with other distortion than the odometry sees; make them again, by "

@@ -166,7 +166,8 @@ def step_errors(estimated: np.ndarray, true: np.ndarray) -> dict[str, float]:
     do, and this is wrong by more than FAILED_ROTATION; otherwise 0. Such a turn is often a flip by
     180 degrees at walking pace, which `failed` does not see.
     """
-    steps, true_steps = _motions(estimated), _motions(true)
+    every = slice(None, -1), slice(1, None)
+    steps, true_steps = _motions(estimated, *every), _motions(true, *every)
     rotation_error = angles(np.linalg.inv(true_steps) @ steps)
     turn = angles(true_steps)
     impossible = (angles(steps) > MAX_TURN) & (rotation_error > FAILED_ROTATION)
@@ -191,11 +192,8 @@ def step_errors(estimated: np.ndarray, true: np.ndarray) -> dict[str, float]:
     }
 
 
-STARTS, ENDS = slice(None, -1), slice(1, None)  # of all steps
-
-
-def _motions(poses: np.ndarray, first: Any = STARTS, last: Any = ENDS) -> np.ndarray:
-    """Motions (m, 4, 4) between poses (n, 4, 4) with indices (m,); steps, if none are given."""
+def _motions(poses: np.ndarray, first: Any, last: Any) -> np.ndarray:
+    """Motions (m, 4, 4) between poses (n, 4, 4) with indices (m,) or slices of as many."""
     return np.linalg.inv(poses[first]) @ poses[last]
 
 

@@ -66,7 +66,7 @@ def read_ids(path: str | Path) -> np.ndarray:
     return channels[..., 0]
 
 
-def _decoded(path: str | Path, flag: int, largest: type = np.uint8) -> np.ndarray:
+def _decoded(path: str | Path, flag: int, largest: type) -> np.ndarray:
     """Decode an image. OpenCV checks PNG's checksums and the end of both formats."""
     try:
         pixels = cv2.imdecode(np.fromfile(path, np.uint8), flag)
