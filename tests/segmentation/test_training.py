@@ -20,6 +20,7 @@ from thesis_repro.segmentation import augmentation, training
 pytestmark = pytest.mark.slow
 
 SIZE = 16
+MODEL = "model.keras"  # of the network with the lowest validation loss
 
 
 def street(count, seed):
@@ -72,7 +73,7 @@ def fit(folder, epochs=3, patience=5, pause=0, interrupted=None, **options):
     """
     model, batches, validation = prepared(**options)
     stop = keras.callbacks.EarlyStopping(patience=patience)
-    best = keras.callbacks.ModelCheckpoint(folder / training.MODEL, save_best_only=True)
+    best = keras.callbacks.ModelCheckpoint(folder / MODEL, save_best_only=True)
     resumable = training.ResumableTraining(folder, batches, [stop, best])
     seen = []
 
@@ -108,7 +109,7 @@ def trained(tmp_path_factory):
 def assert_same(folder, other):
     """Compare history and best model of two trainings to the bit."""
     assert (folder / "history.csv").read_text() == (other / "history.csv").read_text()
-    both = [training.load_model(each / training.MODEL).get_weights() for each in (folder, other)]
+    both = [training.load_model(each / MODEL).get_weights() for each in (folder, other)]
     assert all(map(np.array_equal, *both))
 
 
@@ -244,7 +245,7 @@ def test_the_training_gives_the_recorded_bits(digest):
 @pytest.mark.parametrize("broken", [0, 1])
 def test_a_training_stops_at_a_loss_that_is_not_finite(tmp_path, broken):
     model, batches, validation = prepared()
-    best = keras.callbacks.ModelCheckpoint(tmp_path / training.MODEL, save_best_only=True)
+    best = keras.callbacks.ModelCheckpoint(tmp_path / MODEL, save_best_only=True)
     resumable = training.ResumableTraining(tmp_path, batches, [best])
 
     def break_weights(epoch, logs):
@@ -262,9 +263,9 @@ def test_a_training_stops_at_a_loss_that_is_not_finite(tmp_path, broken):
             callbacks=callbacks,
         )
     assert len(resumable.history) == broken
-    assert (tmp_path / training.MODEL).exists() == bool(broken)
+    assert (tmp_path / MODEL).exists() == bool(broken)
     if broken:  # the best network and the checkpoint are those of the first epoch
-        kept = training.load_model(tmp_path / training.MODEL)
+        kept = training.load_model(tmp_path / MODEL)
         callbacks[1:2] = []
         model.fit(batches.dataset(), epochs=1, verbose=0, callbacks=callbacks)
         assert all(map(np.array_equal, kept.get_weights(), model.get_weights()))

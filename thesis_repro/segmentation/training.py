@@ -24,8 +24,7 @@ from thesis_repro.running import files, program, provenance
 from thesis_repro.segmentation import augmentation
 from thesis_repro.segmentation.exact import same_bits
 
-# files of a training: the network with the lowest validation loss, and what a training resumes from
-MODEL, HISTORY, STATE = "model.keras", "history.csv", "state.npz"
+HISTORY, STATE = "history.csv", "state.npz"  # files of a training; it resumes from the second
 # the way out for a file that Keras 3 does not read
 REBUILD = (
     "build the network (the thesis's: tr.build_unet), load_weights('old.hdf5'), save('new.keras')"
