@@ -1,7 +1,6 @@
 """The figure of paths: from above, and how far each is from the ground truth."""
 
 from collections.abc import Collection
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -12,8 +11,6 @@ from thesis_repro.errors import one_line
 from thesis_repro.odometry import metrics
 
 MARGIN = 0.05  # of the range of an axis
-OF_TRUTH: dict[str, Any] = {"color": TRUTH, "linewidth": 2.2, "alpha": 0.6, "zorder": 1}
-STRAYED = 1  # times the true path's extent: a path that is farther off somewhere is cut
 
 
 def figure_of_paths(
@@ -37,13 +34,16 @@ def figure_of_paths(
         distances = {}
         for name, poses in paths.items():
             distances[name] = np.linalg.norm(poses[:, :3, 3] - true[:, :3, 3], axis=1)
-        limit = STRAYED * np.ptp(true[:, :3, 3], axis=0).max()
-        # nothing is cut if all have strayed
+        # a path that is farther off somewhere has strayed; nothing is cut if all have
+        limit = np.ptp(true[:, :3, 3], axis=0).max()
         kept = [name for name in paths if distances[name].max() <= limit] or kept
         _draw_distances(panels.flat[1], distances, metrics.travelled(true), kept)
-        above.plot(*true[:, [0, 2], 3].T, label="ground truth", **OF_TRUTH)
+        x, z = true[:, [0, 2], 3].T
+        above.plot(x, z, label="ground truth", color=TRUTH, linewidth=2.2, alpha=0.6, zorder=1)
     for index, (name, each) in enumerate(places.items()):
-        label = one_line(name) + " (leaves the picture)" * (name not in kept)
+        label = one_line(name)
+        if name not in kept:
+            label += " (leaves the picture)"
         above.plot(*each.T, label=label, **line_style(index))
     above.set(xlabel="x (m)", ylabel="z (m)", title=f"{one_line(title)} from above")
     above.set_aspect("equal", adjustable="datalim")

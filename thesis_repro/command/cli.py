@@ -172,12 +172,11 @@ def study(options: Any) -> int:
         masked_settings={"detector": detector} if detector else {},
     )
     planned.check()
-    folder = options.folder.absolute()
     _check_outputs(options, *(source.folder for source in planned.sources))
     # this import takes seconds, so the input is checked first
     from keypoint_study.report import study_report
 
-    return study_report.make(planned, folder, options.jobs, options.dask)
+    return study_report.make(planned, options.folder.absolute(), options.jobs, options.dask)
 
 
 COMMANDS = {

@@ -26,8 +26,7 @@ def path(text: str) -> Path:
 def _profile() -> dict[str, Any]:
     import street_world
 
-    sizes = list(street_world.SIZES)
-    return dict(choices=sizes, default="demo", help="size of the world (demo)")
+    return dict(choices=list(street_world.SIZES), default="demo", help="size of the world (demo)")
 
 
 def _boundaries() -> dict[str, Any]:

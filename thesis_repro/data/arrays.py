@@ -71,7 +71,8 @@ class ArraySequence:
         """
         if not hasattr(frames, "__len__") or not len(frames):
             raise InputError("frames: must be a list or an array of one frame or more")
-        if [scales is None, poses is None, speed is None].count(False) > 1:
+        given = [value for value in (scales, poses, speed) if value is not None]
+        if len(given) > 1:
             raise InputError("scales, poses, speed: give one of them, for the lengths of steps")
         if speed is not None and times is None:
             raise InputError("speed: needs the times of the frames, in seconds")
