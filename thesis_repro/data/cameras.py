@@ -1,6 +1,7 @@
 """Cameras in files: numbers, or YAML of OpenCV, ROS, EuRoC or Kalibr."""
 
 import re
+from collections.abc import Iterable
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -69,7 +70,7 @@ def read_camera(path: str | Path, name: str = "") -> Camera:
             camera = _of_yaml(path, _stated(path, text, name))
         else:
             numbers = np.array(re.sub("#.*", "", text).replace(",", " ").split(), np.float64)
-            camera = Camera(_matrix(numbers[:4]), numbers[4:])
+            camera = Camera(pinhole_matrix(numbers[:4]), numbers[4:])
         is_camera = is_camera_matrix(camera.matrix) and len(camera.distortion) in COUNTS
         is_camera = is_camera and bool(np.isfinite(camera.distortion).all())
     except InputError:
@@ -84,7 +85,7 @@ def read_camera(path: str | Path, name: str = "") -> Camera:
     return camera
 
 
-def _matrix(numbers: np.ndarray) -> np.ndarray:
+def pinhole_matrix(numbers: Iterable[float]) -> np.ndarray:
     """Camera matrix, (3, 3), of fx, fy, cx, cy."""
     fx, fy, cx, cy = numbers
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
@@ -121,7 +122,7 @@ def _of_yaml(path: str | Path, stated: dict[str, Any]) -> Camera:
         if "image_width" in stated:
             size = int(stated["image_height"]), int(stated["image_width"])
     else:  # EuRoC, Kalibr
-        matrix = _matrix(_numbers(stated["intrinsics"]))
+        matrix = pinhole_matrix(_numbers(stated["intrinsics"]))
         if "resolution" in stated:
             width, height = stated["resolution"]
             size = int(height), int(width)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from thesis_repro.data import kitti_odometry
-from thesis_repro.data.cameras import Camera
+from thesis_repro.data.cameras import Camera, pinhole_matrix
 from thesis_repro.data.frames import Files, camera_folder
 from thesis_repro.data.trajectories import read_text
 from thesis_repro.errors import InputError
@@ -72,14 +72,13 @@ def _rows(path: Path) -> list[tuple[float, str]]:
 
 def _read_camera(path: Path) -> Camera:
     """Read calib.txt, or know the camera. Raises InputError if there is neither."""
-    known = re.search("freiburg([123])", path.parent.name)
     if path.exists():
         return kitti_odometry.read_camera(path)
+    known = re.search("freiburg([123])", path.parent.name)
     if known is None:
         raise InputError(
             f"{path}: no such file, and the folder's name has no freiburg1, 2 or 3, whose cameras are "
             "known; give --calibration FILE, or write this file with a line P0:"
         )
-    (fx, fy, cx, cy), distortion = FREIBURG[known[1]]
-    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-    return Camera(matrix, np.array(distortion), SIZE)
+    numbers, distortion = FREIBURG[known[1]]
+    return Camera(pinhole_matrix(numbers), np.array(distortion), SIZE)
