@@ -20,24 +20,29 @@ pytestmark = pytest.mark.slow
 
 SIZE = 64
 IMAGES = np.random.default_rng(0).integers(0, 256, (7, SIZE, SIZE, 1), np.uint8)
+COLOURS = np.random.default_rng(2).integers(0, 256, (2, SIZE, SIZE, 3), np.uint8)
 
 
-def untrained(seed, size=SIZE, channels=1):
+def untrained(seed, channels=1):
     """Return a U-Net with random weights and batch statistics, as varied as after a training."""
     keras.utils.set_random_seed(seed)
-    model = build_unet((size, size, channels), 35, 4)
-    values = np.random.default_rng(seed)
+    model = build_unet((SIZE, SIZE, channels), 35, 4)
+    random = np.random.default_rng(seed)
     for layer in model.layers:
         if isinstance(layer, keras.layers.BatchNormalization):
-            layer.set_weights(
-                [values.uniform(0.5, 1.5, weights.shape) for weights in layer.get_weights()]
-            )
+            weights = [random.uniform(0.5, 1.5, each.shape) for each in layer.get_weights()]
+            layer.set_weights(weights)
     return model
 
 
 @pytest.fixture(scope="module")
 def model():
     return untrained(1)
+
+
+@pytest.fixture(scope="module")
+def of_colours():
+    return untrained(3, channels=3)
 
 
 @pytest.fixture(scope="module")
@@ -57,44 +62,45 @@ def contents(folder):
 def test_predict_gives_the_most_probable_class(model):
     labels = prediction.predict(model, IMAGES, batch_size=3)
 
-    assert (
-        labels.dtype == np.uint8 and labels.shape == (7, SIZE, SIZE) and len(np.unique(labels)) > 3
-    )
+    assert labels.dtype == np.uint8 and labels.shape == (7, SIZE, SIZE)
+    assert len(np.unique(labels)) > 3
     assert np.array_equal(labels, model.predict(IMAGES.astype(np.float32), verbose=0).argmax(-1))
     for wrong in (IMAGES[:, :32, :32], IMAGES / np.float32(255)):
         with pytest.raises(InputError, match="give uint8 images"):
             prediction.predict(model, wrong)
 
 
-def test_a_scale_multiplies_the_gray_values(model, frames, tmp_path):
-    scaled = prediction.predict(model, IMAGES, scale=1 / 255)
-    expected = model.predict(IMAGES * np.float32(1 / 255), verbose=0).argmax(-1)
-    assert np.array_equal(scaled, expected)
+@pytest.mark.parametrize(
+    "option, values",
+    [
+        ({"scale": 1 / 255}, IMAGES * np.float32(1 / 255)),
+        ({"preprocess": "tf"}, IMAGES / np.float32(127.5) - 1),
+    ],
+)
+def test_gray_values_are_changed_and_label_maps_then_replaced(
+    model, frames, tmp_path, option, values
+):
+    expected = model.predict(values, verbose=0).argmax(-1)
+    assert np.array_equal(prediction.predict(model, IMAGES, **option), expected)
     prediction.write_label_maps(model, frames[:2], tmp_path)
-    unscaled = contents(tmp_path)
-    assert prediction.write_label_maps(model, frames[:2], tmp_path, scale=1 / 255) == 2
-    assert contents(tmp_path) != unscaled
-
-
-def test_values_are_preprocessed_as_keras_applications_do_it(frames, tmp_path):
-    gray, colours = untrained(1), untrained(3, channels=3)
-    expected = gray.predict(IMAGES / np.float32(127.5) - 1, verbose=0).argmax(-1)
-    assert np.array_equal(prediction.predict(gray, IMAGES, preprocess="tf"), expected)
-    pictures = np.random.default_rng(2).integers(0, 256, (2, SIZE, SIZE, 3), np.uint8)
-    of_imagenet = {  # the means of ImageNet, and their order
-        "torch": (pictures / 255 - [0.485, 0.456, 0.406]) / [0.229, 0.224, 0.225],
-        "caffe": pictures[..., ::-1] - [103.939, 116.779, 123.68],
-    }
-    for mode, wanted in of_imagenet.items():
-        expected = colours.predict(wanted.astype(np.float32), verbose=0).argmax(-1)
-        predicted = prediction.predict(colours, pictures, preprocess=mode)
-        assert np.mean(predicted == expected) > 0.999
-        with pytest.raises(InputError, match=mode):
-            prediction.predict(gray, IMAGES, preprocess=mode)
-    prediction.write_label_maps(gray, frames[:2], tmp_path)
     usual = contents(tmp_path)
-    assert prediction.write_label_maps(gray, frames[:2], tmp_path, preprocess="tf") == 2
+    assert prediction.write_label_maps(model, frames[:2], tmp_path, **option) == 2
     assert contents(tmp_path) != usual
+
+
+@pytest.mark.parametrize(
+    "mode, values",
+    [  # the means of ImageNet, and their order
+        ("torch", (COLOURS / 255 - [0.485, 0.456, 0.406]) / [0.229, 0.224, 0.225]),
+        ("caffe", COLOURS[..., ::-1] - [103.939, 116.779, 123.68]),
+    ],
+)
+def test_colours_are_preprocessed_as_keras_applications_do_it(model, of_colours, mode, values):
+    expected = of_colours.predict(values.astype(np.float32), verbose=0).argmax(-1)
+    predicted = prediction.predict(of_colours, COLOURS, preprocess=mode)
+    assert np.mean(predicted == expected) > 0.999
+    with pytest.raises(InputError, match=mode):
+        prediction.predict(model, IMAGES, preprocess=mode)
 
 
 @pytest.mark.parametrize("scale", ["0", "-1", "1/0", "1e400", "nan", "0/255", "1/", "/255", "x"])
@@ -147,17 +153,14 @@ def test_images_that_cannot_be_predicted_are_refused(model, frames, tmp_path):
         prediction.write_label_maps(model, [frames[0], frames[0]], tmp_path / "twice")
 
 
-def test_colour_input(tmp_path):
-    model = untrained(3, channels=3)
-    picture = np.random.default_rng(2).integers(0, 256, (SIZE, SIZE, 3), np.uint8)
+def test_colour_input(of_colours, tmp_path):
+    picture = COLOURS[0]
     files.write_png(tmp_path / "street.png", picture[..., ::-1])
-    prediction.write_label_maps(model, [tmp_path / "street.png"], tmp_path / "out")
-
-    expected = prediction.predict(model, picture[None])[0]
-    assert np.array_equal(
-        cityscapes.read_label_map(tmp_path / "out" / "street.png")[::5, ::5], expected
-    )
-    assert not np.array_equal(expected, prediction.predict(model, picture[None, ..., ::-1])[0])
+    prediction.write_label_maps(of_colours, [tmp_path / "street.png"], tmp_path / "out")
+    expected, swapped = prediction.predict(of_colours, np.stack([picture, picture[..., ::-1]]))
+    written = cityscapes.read_label_map(tmp_path / "out/street.png")
+    assert np.array_equal(written[::5, ::5], expected)
+    assert not np.array_equal(expected, swapped)
 
 
 @pytest.mark.parametrize("suffix", [".keras", ".hdf5"])
@@ -244,8 +247,7 @@ def test_confusion_matrix_and_cityscapes_scores():
     )
 
 
-def test_quality_agrees_with_keras_and_with_a_plain_count():
-    model = untrained(1)
+def test_quality_agrees_with_keras_and_with_a_plain_count(model):
     labels = np.random.default_rng(1).choice(np.array([7, 11, 23, 26], np.uint8), IMAGES.shape[:3])
     measured = quality.quality(model, IMAGES, labels, batch_size=3)
     model.compile("adam", training.total_loss(), metrics=training.metrics())
