@@ -6,18 +6,12 @@ import platform
 import signal
 import subprocess
 import sys
+from unittest.mock import Mock
 
 import pytest
 
 from thesis_repro.errors import InputError
 from thesis_repro.running import files, program, workers
-
-
-def failing(error):
-    def main():
-        raise error
-
-    return main
 
 
 @pytest.fixture(autouse=True)
@@ -40,7 +34,7 @@ def handlers():
     ],
 )
 def test_bad_input_and_errors_of_the_machine_are_one_line(error, says, capsys):
-    assert program.run(failing(error)) == 1
+    assert program.run(Mock(side_effect=error)) == 1
     line = capsys.readouterr().err
     assert line.startswith("error: ") and says in line and line.count("\n") == 1
 
@@ -57,7 +51,7 @@ def test_what_cannot_be_printed_ends_without_a_traceback(target, status, says):
 
 def test_unexpected_errors_are_raised():
     with pytest.raises(ZeroDivisionError):
-        program.run(failing(ZeroDivisionError("1/0")))
+        program.run(Mock(side_effect=ZeroDivisionError))
 
 
 def test_warnings_and_the_summary_are_printed_apart(capsys):
@@ -124,9 +118,7 @@ def test_levels_of_threads_become_one_number(given, left, monkeypatch):
 
 
 def test_a_system_without_semaphores_gets_one_process_and_one_line(monkeypatch, caplog):
-    def refuse(*arguments, **named):
-        raise OSError(errno.EROFS, "Read-only file system")
-
+    refuse = Mock(side_effect=OSError(errno.EROFS, "Read-only file system"))
     monkeypatch.setattr(workers, "ProcessPoolExecutor", refuse)
     with workers.open_pool(2) as pool:
         assert pool.size == 1 and list(pool.run(pow, [(2, 3)])) == [8]

@@ -3,6 +3,7 @@
 import fcntl
 import os
 from importlib import metadata
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -131,9 +132,6 @@ def test_the_digest_of_code_changes_with_any_module_of_its_folders(
 
 def test_a_package_that_another_distribution_brings_has_a_version(monkeypatch):
     """As tensorflow-cpu brings tensorflow."""
-
-    def none(name):
-        raise metadata.PackageNotFoundError(name)
-
+    none = Mock(side_effect=metadata.PackageNotFoundError)
     monkeypatch.setattr(provenance.metadata, "version", none)
     assert provenance.versions("numpy")["versions"]["numpy"] == np.__version__

@@ -25,14 +25,10 @@ def test_any_backend_has_the_loss_the_scores_and_the_order_of_the_batches():
     labels[0, :3] = augmentation.NOTHING
     predicted = random.dirichlet(np.full(N_CLASSES, 0.05), labels.shape).astype(np.float32)
     true = augmentation.one_hot(labels, N_CLASSES)
-    theirs = [
-        training.total_loss()(true, predicted),
-        *(m(true, predicted) for m in training.metrics()),
-    ]
-    ours = [
-        function(tf.constant(labels), tf.constant(predicted))
-        for function in camvid.loss_and_scores()
-    ]
+    functions = [training.total_loss(), *training.metrics()]
+    theirs = [function(true, predicted) for function in functions]
+    given = tf.constant(labels), tf.constant(predicted)
+    ours = [function(*given) for function in camvid.loss_and_scores()]
     assert np.allclose([np.mean(value) for value in theirs], ours, rtol=1e-6)
     images = np.arange(5 * 16 * 16).reshape(5, 16, 16, 1).astype(np.uint8)
     batches = training.Batches([(images, labels)], 4, seed=5)

@@ -20,18 +20,20 @@ def runs(name):
 
 
 def of_the_thesis(metric=None):
-    masked, baseline = (
-        comparisons.of_method(runs("runs"), name) for name in ("masked", "baseline")
-    )
+    masked = comparisons.of_method(runs("runs"), "masked")
     if metric is None:
         return tables.table_4_1(masked, COMPLETE)
-    shuffled = runs("shuffled_runs")
-    return tables.table_of_change(masked, baseline, shuffled, metric, COMPLETE)
+    baseline = comparisons.of_method(runs("runs"), "baseline")
+    return tables.table_of_change(masked, baseline, runs("shuffled_runs"), metric, COMPLETE)
 
 
 def all_pairs():
     rows = comparison.all_of(comparisons.comparisons_of(runs("runs")))
     return comparison.table_of_ratios(rows)
+
+
+def few(name):
+    return few_keypoints.table_of_few(few_keypoints.ratios_to_all(runs(name)))
 
 
 TABLES = {
@@ -41,12 +43,8 @@ TABLES = {
     "table_4_2": lambda: of_the_thesis("rmse"),
     "table_4_3": lambda: of_the_thesis("mae"),
     "refined_widths": lambda: evidence.table_of_widths(runs("refined_widths_runs")),
-    "every_second": lambda: few_keypoints.table_of_few(
-        few_keypoints.ratios_to_all(runs("every_second_runs"))
-    ),
-    "few_keypoints": lambda: few_keypoints.table_of_few(
-        few_keypoints.ratios_to_all(runs("few_keypoints_runs"))
-    ),
+    "every_second": lambda: few("every_second_runs"),
+    "few_keypoints": lambda: few("few_keypoints_runs"),
 }
 
 
@@ -60,9 +58,8 @@ def words_and_numbers(path, columns):
 def test_tables_in_git_are_those_of_the_runs_in_git(name, tmp_path):
     table = TABLES[name]()
     style.save_table(table, tmp_path, name, "")
-    (words, numbers), (words_in_git, numbers_in_git) = (
-        words_and_numbers(folder / f"{name}.csv", list(table))
-        for folder in (tmp_path, evidence.FOLDER)
-    )
+    words, numbers = words_and_numbers(tmp_path / f"{name}.csv", list(table))
+    in_git = evidence.FOLDER / f"{name}.csv"
+    words_in_git, numbers_in_git = words_and_numbers(in_git, list(table))
     assert words.splitlines() == words_in_git.splitlines()
     assert numbers == pytest.approx(numbers_in_git, rel=1e-3, abs=0.011)  # runs have six digits

@@ -21,10 +21,9 @@ pytestmark = pytest.mark.slow
 
 
 def test_bench_compares_calls_and_runs_with_opencvs(small_world, monkeypatch):
-    monkeypatch.setattr(bench, "KEYPOINTS", (100,))
-    monkeypatch.setattr(bench, "LENGTHS", (5, 7))
-    monkeypatch.setattr(bench, "TOGETHER", (1, 2))
-    monkeypatch.setattr(bench, "FRAMES", 4)
+    small = {"KEYPOINTS": (100,), "LENGTHS": (5, 7), "TOGETHER": (1, 2), "FRAMES": 4}
+    for name, value in small.items():
+        monkeypatch.setattr(bench, name, value)
     table = bench.bench(Sequence(small_world / "kitti", "00").subset(4))
     assert len(table) == 3 + 2 + 2 and (table["ratio"] > 0).all()
     assert table["ratio"].tolist() == pytest.approx(table["measured"] / table["reference"])
@@ -33,25 +32,16 @@ def test_bench_compares_calls_and_runs_with_opencvs(small_world, monkeypatch):
 
 @pytest.mark.torture
 def test_the_training_writes_a_model_and_its_card(camvid_real, tmp_path, monkeypatch):
-    for name, value in (
-        ("COMMON", train_shipped.COMMON._replace(epochs=1)),
-        ("LAST", train_shipped.LAST._replace(epochs=1)),
-        ("EPOCH", 1),
-    ):
-        monkeypatch.setattr(train_shipped, name, value)
-    kitti_semantic = camvid_real.parent / "kitti_semantic"
-    arguments = [
-        str(camvid_real),
-        str(kitti_semantic),
-        str(camvid_real.parent / "kitti_pseudo"),
-        str(tmp_path),
-    ]
-    train_shipped.main(arguments)
+    for name in ("COMMON", "LAST"):
+        options = getattr(train_shipped, name)
+        monkeypatch.setattr(train_shipped, name, options._replace(epochs=1))
+    monkeypatch.setattr(train_shipped, "EPOCH", 1)
+    data = camvid_real.parent
+    folders = camvid_real, data / "kitti_semantic", data / "kitti_pseudo", tmp_path
+    train_shipped.main([str(folder) for folder in folders])
     model = keras.models.load_model(tmp_path / "streets.keras", compile=False)
-    assert (
-        model.output_shape == (None, 320, 320, 35)
-        and "20001" in (tmp_path / "README.md").read_text()
-    )
+    assert model.output_shape == (None, 320, 320, 35)
+    assert "20001" in (tmp_path / "README.md").read_text()
 
 
 def test_evidence_keeps_what_shows_no_frame(executed, tmp_path, monkeypatch):
