@@ -214,6 +214,12 @@ def test_distortion_is_taken_out_as_opencv_does(own, name, text):
     assert own / name in sequence.files
 
 
+def refused(path, text, said):
+    path.write_text(text)
+    with pytest.raises(InputError, match=f"{path.name}: {said}"):
+        Sequence(None, path.parent, calibration=path)
+
+
 @pytest.mark.parametrize(
     "name, text",
     [
@@ -233,9 +239,7 @@ def test_distortion_is_taken_out_as_opencv_does(own, name, text):
     ],
 )
 def test_another_file_is_no_camera(own, name, text):
-    (own / name).write_text(text)
-    with pytest.raises(InputError, match=f"{name}: must hold fx fy cx cy.*OpenCV, ROS, EuRoC"):
-        Sequence(None, own, calibration=own / name)
+    refused(own / name, text, "must hold fx fy cx cy.*OpenCV, ROS, EuRoC")
 
 
 @pytest.mark.parametrize(
@@ -250,9 +254,7 @@ def test_another_file_is_no_camera(own, name, text):
     ],
 )
 def test_a_camera_that_cannot_be_used_is_named(own, text, said):
-    (own / "camera.yaml").write_text(text)
-    with pytest.raises(InputError, match=f"camera.yaml: {said}"):
-        Sequence(None, own, calibration=own / "camera.yaml")
+    refused(own / "camera.yaml", text, said)
 
 
 @pytest.mark.parametrize(
