@@ -50,13 +50,14 @@ def write_euroc(folder, images, intrinsics, stamps, distortion=(0.0, 0.0, 0.0, 0
     (camera / "sensor.yaml").write_text(text)
 
 
-def write_euroc_truth(path, poses, stamps):
+def write_euroc_truth(path, poses, stamps, digits=15):
     """Poses of a body, (n, 4, 4), at times in nanoseconds; quaternions have w first."""
     quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat()[:, [3, 0, 1, 2]]
     rows = np.column_stack([poses[:, :3, 3], quaternions, np.zeros((len(poses), 9))])
     lines = ["#timestamp, p_RS_R_x [m], ..."]
     for stamp, row in zip(stamps, rows.tolist(), strict=True):
-        lines.append(",".join(map(repr, [int(stamp), *row])))
+        numbers = [f"{number:.{digits}f}" for number in row]
+        lines.append(",".join([str(int(stamp)), *numbers]))
     path.parent.mkdir(exist_ok=True)
     path.write_text("\n".join([*lines, ""]))
 

@@ -75,7 +75,8 @@ def drives(tmp_path_factory):
     at = np.arange(0.1021, 1.3, 0.005)
     body = between(true @ np.linalg.inv(T_BS), 0.05 * np.arange(COUNT), at)
     truth = layout.poses(root / "MH_01")
-    write_euroc_truth(truth, body, [START_NS + round(1e9 * time) for time in at])
+    # six digits, as the data set has them, so quaternions have a length of nearly 1
+    write_euroc_truth(truth, body, [START_NS + round(1e9 * time) for time in at], digits=6)
     # TUM: 30 frames a second, 100 poses of the camera, with two gaps of 0.11 s
     folder = root / "rgbd_dataset_freiburg1_street"
     seconds = 1305031102.175304 + np.arange(COUNT) / 30
