@@ -218,6 +218,8 @@ def test_options_of_the_odometry(tiny_kitti, tmp_path, capsys):
     assert 10 < spread["mean_keypoints"] <= 20 < plain["mean_keypoints"]
     assert strongest["mean_keypoints"] == 20
     assert undistorted["mean_keypoints"] != plain["mean_keypoints"]
+    assert run("odometry", *where, 0, "--fill", 5) == 1  # there is no mask to fill
+    assert "--fill" in capsys.readouterr().err
 
 
 def test_label_maps_in_other_ids_give_the_same_masks(tiny_kitti, tmp_path):

@@ -215,10 +215,21 @@ def test_a_file_of_keras_2_is_refused_and_its_weights_load(tmp_path):
         training.load_model(old)
 
 
-def test_a_saved_model_folder_and_code_in_a_file_are_named(tmp_path):
+def test_what_is_no_file_of_keras_is_named(tmp_path):
     (tmp_path / "saved_model").mkdir()
-    with pytest.raises(InputError, match="saved_model: is a folder"):
-        training.load_model(tmp_path / "saved_model")
+    (tmp_path / "unfetched.keras").write_text("version https://git-lfs.github.com/spec/v1\n")
+    (tmp_path / "network.onnx").write_bytes(b"onnx")
+    for name, says in (
+        ("saved_model", "is a folder"),
+        ("unfetched.keras", "git lfs pull"),
+        ("network.onnx", "--labels"),
+        ("missing.keras", "no such model"),
+    ):
+        with pytest.raises(InputError, match=f"{name}: .*{says}"):
+            training.load_model(tmp_path / name)
+
+
+def test_code_in_a_file_is_refused(tmp_path):
     inputs = keras.Input((SIZE, SIZE, 1))
     code = keras.layers.Lambda(lambda x: x + 1)(inputs)
     for name in ("code.keras", "code.h5"):

@@ -286,7 +286,7 @@ def _detector(options: Any) -> Any:
         if detector or vars(options).get("max_keypoints", 2000) != 2000:
             raise InputError("--spread N: goes without --max-keypoints and --detector")
         detector = spread(options.spread)
-    if options.fill:
+    if vars(options).get("fill"):
         detector = filled(options.fill, detector)
     return detector
 
@@ -361,6 +361,8 @@ def _masks(options: Any, sequence: Any) -> Any:
         return LabelMasks(options.labels, sequence, options.dilation, settings, options.ids)
     if ready_made:
         return MaskFolder(ready_made, sequence, options.invert)
+    if vars(options).get("fill"):
+        raise InputError("--fill N: needs masks to fill, --labels DIR or --masks DIR")
     return None
 
 

@@ -25,6 +25,8 @@ from thesis_repro.segmentation import augmentation
 from thesis_repro.segmentation.exact import same_bits
 
 HISTORY, STATE = "history.csv", "state.npz"  # files of a training; it resumes from the second
+OTHER_FRAMEWORKS = (".onnx", ".tflite", ".pt", ".pth", ".pb", ".engine")  # endings of networks
+LFS_POINTER = b"version https://git-lfs"  # in place of a large file that was not fetched
 # the way out for a file that Keras 3 does not read
 REBUILD = (
     "build the network (the thesis's: tr.build_unet), load_weights('old.hdf5'), save('new.keras')"
@@ -309,6 +311,13 @@ def load_model(path: str | Path) -> Any:
         )
     if not Path(path).is_file():
         raise InputError(f"{path}: no such model; train one or name another file")
+    if Path(path).suffix.lower() in OTHER_FRAMEWORKS:
+        raise InputError(
+            f"{path}: not of Keras; predict label maps where it runs, and give their folder, --labels DIR"
+        )
+    with open(path, "rb") as file:
+        if file.read(len(LFS_POINTER)) == LFS_POINTER:
+            raise InputError(f"{path}: a Git LFS pointer, not the model; git lfs pull fetches it")
     try:
         model = keras.models.load_model(path, compile=False, safe_mode=True)
     except Exception as error:  # Keras, h5py and zipfile raise many kinds
