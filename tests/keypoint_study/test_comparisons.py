@@ -289,6 +289,15 @@ def test_other_repetitions_confirm_a_real_optimum_and_no_chance():
     assert tables.stability(repeated, baseline).isna().all(axis=None)
 
 
+def test_two_widths_are_enough_to_tell_whether_the_best_is_stable():
+    errors = {5: (1, 3, 2), 10: (2, 1, 4)}  # best: 5, 10, 5
+    rows = [("00", n, width, error) for width in errors for n, error in enumerate(errors[width])]
+    masked = pd.DataFrame(rows, columns=["sequence", "repetition", "dilation_width", "rmse"])
+    found = tables.stability(masked, masked.assign(rmse=2.0)).loc["00"]
+    assert found["same_best"] == pytest.approx(100 / 3)  # one pair of three
+    assert found["elsewhere"] == pytest.approx((5 / 2 + 6 / 2 + 4 / 2) / 3 / 2)
+
+
 def test_the_best_of_many_widths_looks_better_if_masks_do_nothing():
     _, baseline = parts_of(lambda *_: 1.0, repetitions=400, noise=0.2)
     studies = tables.null_distribution(baseline, 15, "rmse")
