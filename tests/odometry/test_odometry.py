@@ -400,6 +400,17 @@ def test_each_estimator_follows_a_turn_among_wrong_matches(name, seed):
     assert np.abs((previous @ step.essential * current).sum(axis=1)).max() < 1e-3
 
 
+def test_inliers_alone_vote_if_the_settings_say_so():
+    votes = {}
+    for name in ("thesis", "inliers"):
+        step, _ = turning(replace(THESIS, estimator=ESTIMATORS[name].make))
+        votes[name] = step.motion.pose_inliers
+    sides = step.matches.current, step.matches.previous
+    expected = [cv2.recoverPose(step.essential, *sides)[0]]
+    expected += [cv2.recoverPose(step.essential, *(side[step.inliers] for side in sides))[0]]
+    assert [*votes.values()] == expected and expected[0] > expected[1]
+
+
 @pytest.mark.parametrize("name", ESTIMATORS)
 def test_too_large_turns_are_flagged_and_kept(name):
     settings = replace(THESIS, estimator=ESTIMATORS[name].make)
