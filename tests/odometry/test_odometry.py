@@ -753,6 +753,15 @@ def test_frames_stay_the_callers_and_one_buffer_may_hold_them_all(drive):
     assert buffer.flags.writeable
 
 
+def test_no_corners_are_kept_of_memory_that_others_can_change(drive):
+    images = [drive.frame(0), drive.frame(5)]
+    memory = bytearray(images[0].size)
+    view = np.frombuffer(memoryview(memory).toreadonly(), np.uint8).reshape(images[0].shape)
+    for image in images:
+        memory[:] = image.tobytes()
+        np.testing.assert_array_equal(sharing.corners.detect(view), detect(image))
+
+
 def test_a_float_mask_is_named_where_not_all_of_the_frame_is_visible(drive):
     few = Changed(drive, frames=2)
     few.visible = lambda index: np.full(drive.size, 255, np.uint8)

@@ -230,6 +230,17 @@ def test_opencv_is_called_where_it_adds_in_another_order(monkeypatch):
         reason_for_opencv.cache_clear()
 
 
+def test_no_pyramid_is_kept_of_memory_that_others_can_change():
+    random = np.random.default_rng(9)
+    images, memory = [*street(random, 2, (90, 120))], bytearray(90 * 120)
+    view = np.frombuffer(memoryview(memory).toreadonly(), np.uint8).reshape(90, 120)
+    points = random.uniform((20, 20), (100, 70), (40, 2)).astype(np.float32)
+    for image in images:
+        memory[:] = image.tobytes()
+        expected = cv2.calcOpticalFlowPyrLK(image, images[1], points, None)[0]
+        np.testing.assert_array_equal(track(view, images[1], points)[0], expected)
+
+
 @pytest.mark.skipif(bool(reason_for_opencv()), reason=reason_for_opencv() or "lanes")
 def test_lanes_are_faster_than_opencv():
     """Where LLVM vectorises them. Scalar, they take 2 to 4 times as long as OpenCV."""
