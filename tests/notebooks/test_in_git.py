@@ -7,7 +7,7 @@ from collections import Counter
 
 import nbformat
 import pytest
-from cells import NOTEBOOKS, code_of, named
+from cells import NOTEBOOKS, code_of
 from nbconvert import ScriptExporter
 
 from thesis import run
@@ -20,33 +20,18 @@ CALLS = {
     "A.2.1": 8,
     "A.2.2": 10,
     "A.2.3": 10,
-    "A.3": 32,
+    "A.3": 33,
     "A.4": 7,
     "A.5": 6,
+    "A.5.1": 5,  # which the copy of the thesis lacks
     "A.5.2": 4,
     "A.6": 9,
     "A.7.1": 13,
     "A.7.2": 17,
     "A.8": 15,
 }
-# the notebook of a section, and calls that are in another one
-MIRRORS: dict = {
-    "A.1": "01",
-    "A.2": "01",
-    "A.3": "02",
-    "A.4": "03",
-    "A.5": "04",
-    "A.6": "04",
-    "A.7": "05",
-    "A.8": "06",
-    ("A.5.2", "build_unet"): "03",
-    # the label maps of A.8
-    ("A.8", "len"): "05",
-    ("A.8", "np.expand_dims"): "05",
-    ("A.8", "model.predict"): "05",
-    ("A.8", "np.argmax"): "05",
-}
-RENAMED = {"RandomBrightness": "RandomBrightnessContrast"}  # by the library
+# what is called otherwise in a notebook: by the library, and a transform by its variable
+RENAMED = {"RandomBrightness": "RandomBrightnessContrast", "transform": "compose"}
 
 
 @pytest.mark.parametrize("name", NOTEBOOKS)
@@ -67,6 +52,19 @@ def test_a_notebook_reads_only_what_those_that_it_needs_have_written():
         assert set(read) <= needs[name.removesuffix(".ipynb")], name
 
 
+def code_below_headings(name):
+    """{heading: code} of the cells below each heading of a notebook."""
+    code, heading = {}, ""
+    for cell in json.loads((ROOT / "notebooks" / name).read_text())["cells"]:
+        text = "".join(cell["source"])
+        if cell["cell_type"] == "code":
+            code[heading] = code.get(heading, "") + text + "\n\n"
+        elif headings := re.findall("(?m)^#+ (.*)$", text):
+            heading = headings[-1]
+            assert heading not in code, heading
+    return code
+
+
 def called_names(code):
     """The names of all functions, methods and classes that code calls."""
     tree = ast.parse(re.sub("(?m)^%", "#", code))
@@ -74,21 +72,18 @@ def called_names(code):
     return {getattr(function, "attr", getattr(function, "id", "")) for function in called}
 
 
-def test_every_call_of_each_section_of_the_appendix_is_live_in_the_notebook_that_mirrors_it():
+def test_every_call_of_the_appendix_is_live_below_the_heading_that_the_table_names():
     table = (ROOT / "docs" / "appendix-calls.md").read_text()
-    rows = re.findall(r"^\| (A[\d.]+) \| `([^|]*)` \| (\d\d) \| `([^|]*)` \|", table, re.MULTILINE)
-    assert Counter(section for section, *_ in rows) == CALLS
-    code = {name[:2]: code_of(name) for name in NOTEBOOKS}
-    for section, call, number, where in rows:
-        assert number == MIRRORS.get((section, call), MIRRORS[section[:3]]), (section, call)
-        assert where in code[number], (section, where)  # as a reader's search finds it
-        names = re.findall(r"(\w+)(?=,|\(|$)", call.replace("transform(image, mask)", "compose"))
-        names = [] if call.startswith("%") else [RENAMED.get(name, name) for name in names]
-        assert set(names) <= called_names(code[number]), (section, call)
-
-
-def test_what_the_copy_of_the_thesis_lacks_is_in_the_notebook_that_the_table_names():
-    table = (ROOT / "docs" / "appendix-calls.md").read_text().partition("\n## ")[2]
-    rows = re.findall(r"^\|[^|]*\| (\d\d) \| `([^|]*)` \|", table, re.MULTILINE)
-    assert len(rows) == 7
-    assert [row for row in rows if row[1] not in code_of(named(row[0]))] == []
+    rows = re.findall(r"^\| (A[\d.]+) \| (`.*?`) \| (\d\d), (.*?) \|", table, re.MULTILINE)
+    calls = [(section, call) for section, listed, *_ in rows for call in listed.split(", ")]
+    assert len(set(calls)) == len(calls)
+    assert Counter(section for section, _ in calls) == CALLS
+    lessons = {name[:2]: code_below_headings(name) for name in NOTEBOOKS}
+    for section, listed, number, heading in rows:
+        code = lessons[number][heading]
+        for call in re.findall("`(.*?)`", listed):
+            name = call.rpartition(".")[2]
+            found = (
+                call in code if call[0] == "%" else RENAMED.get(name, name) in called_names(code)
+            )
+            assert found, (section, call, number, heading)
