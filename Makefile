@@ -38,7 +38,7 @@ help:
 	@echo "                 in a container LISTEN=0.0.0.0"
 	@echo "make check-data  check the folders KITTI=/path CITYSCAPES=/path KITTI_SEMANTIC=/path"
 	@echo "make test, lint  run the tests, and every notebook with PROFILE=smoke; check style (Ruff), types (mypy), imports"
-	@echo "make torture     run the tests of kills, faults, bad input, and of the oldest and newest packages (some minutes)"
+	@echo "make torture     run the tests of kills, faults, bad input, the book, and of the oldest and newest packages (some minutes)"
 	@echo "make book        after make figures: write its book into build/; a warning is an error"
 	@echo "make excerpts    cut the frames of the evidence from KITTI=/path RAW=/path, and check them, into build/excerpts"
 	@echo "make evidence    make figures PROFILE=thesis from KITTI=build/excerpts, and keep what shows no frame; from other"

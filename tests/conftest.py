@@ -24,18 +24,28 @@ from joblib import cpu_count
 # file executes.
 LONGEST = (
     "test_executed.py",
-    "test_training.py",
-    "test_prediction.py",
-    "test_dask.py",
     "test_odometry.py",
+    "test_training.py",
     "test_study.py",
-    "test_own_sources.py",
+    "test_street_world.py",
+    "test_opencv_exact.py",
+    "test_prediction.py",
+    "test_docs.py",
     "test_runner.py",
+    "test_own_sources.py",
     # these need what the first one executes, and would wait for it
     "test_exercises.py",
-    "test_book.py",
     "test_tools.py",
 )
+# all their tests are slow, and they load TensorFlow, which takes four seconds
+TENSORFLOW = {
+    "test_camvid.py",
+    "test_exact.py",
+    "test_prediction.py",
+    "test_tools.py",
+    "test_training.py",
+    "test_unet.py",
+}
 # fixtures that take seconds
 SLOW_FIXTURES = {
     "small_world",
@@ -46,6 +56,12 @@ SLOW_FIXTURES = {
     "reference",
     "executed",
 }
+
+
+def pytest_ignore_collect(collection_path, config):
+    if config.option.markexpr == "not slow" and collection_path.name in TENSORFLOW:
+        return True
+    return None
 
 
 def pytest_collection_modifyitems(items):

@@ -1,5 +1,6 @@
 """The commands and Python examples of the README and of docs run."""
 
+import contextlib
 import pydoc
 import re
 import shlex
@@ -74,33 +75,38 @@ def test_help_begins_with_an_example_that_runs(small_world, tmp_path, monkeypatc
     assert names["result"].frames["detected"].mean() == 200  # the last one, spread
 
 
-@pytest.fixture
-def examples(small_world, tmp_path, monkeypatch):
-    """The Python recipes for what people bring, run beside a world and its frames and video."""
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "world").symlink_to(small_world)
-    (tmp_path / "frames").symlink_to(small_world / "kitti/sequences/00/image_0")
-    images = [cv2.imread(str(path)) for path in sorted((tmp_path / "frames").iterdir())]
+@pytest.fixture(scope="module")
+def examples(small_world, tmp_path_factory):
+    """The Python recipes for what people bring, run beside a world and its frames and video.
+
+    Returns the folder where they ran, the frames, and the names that each leaves.
+    """
+    folder = tmp_path_factory.mktemp("examples")
+    (folder / "world").symlink_to(small_world)
+    (folder / "frames").symlink_to(small_world / "kitti/sequences/00/image_0")
+    images = [cv2.imread(str(path)) for path in sorted((folder / "frames").iterdir())]
     height, width = images[0].shape[:2]
-    video = cv2.VideoWriter("drive.mp4", cv2.VideoWriter_fourcc(*"mp4v"), 25, (width, height))
+    kind = cv2.VideoWriter_fourcc(*"mp4v")
+    video = cv2.VideoWriter(str(folder / "drive.mp4"), kind, 25, (width, height))
     for image in images:
         video.write(image)
     video.release()
     results = []
-    for example in blocks(ROOT / "docs/own-data.md", "python"):
-        names = {}
-        exec(example, names)
-        results.append(names)
-    return images, results
+    with contextlib.chdir(folder):
+        for example in blocks(ROOT / "docs/own-data.md", "python"):
+            names = {}
+            exec(example, names)
+            results.append(names)
+    return folder, images, results
 
 
 def test_the_recipes_for_what_people_bring_run(examples):
-    images, (memory, network, own, _) = examples
+    folder, images, (memory, network, own, _) = examples
     sequence, result = memory["sequence"], memory["result"]
     assert len(sequence) == len(images) == len(result.poses)
     np.testing.assert_allclose(sequence.scales[1:], 8.3 / 25)
     assert 3 < np.linalg.norm(result.poses[-1, :3, 3]) < 3.7  # eleven steps
-    assert np.array_equal(read_poses("path.txt"), result.poses)
+    assert np.array_equal(read_poses(folder / "path.txt"), result.poses)
 
     last, mask = network["step"], network["mask_of"](images[-1][..., 0])
     u, v = last.keypoints.astype(int).T
@@ -111,13 +117,13 @@ def test_the_recipes_for_what_people_bring_run(examples):
     plain = own["detect"](images[0][..., 0], None, None)
     assert counts[0] == len(plain) and own["result"].frames["updated"][1:].all()
 
-    camera = read_camera("sensor.yaml")
+    camera = read_camera(folder / "sensor.yaml")
     assert camera.matrix[0, 0] == 458.7 and camera.distortion[3] == 0.00002
     assert np.array_equal(camera.body[:3, 3], [-0.02, -0.06, 0.01])
 
 
 def test_points_that_leave_the_frame_are_not_found_by_the_recipe_for_own_matches(examples):
-    images, (*_, own, _) = examples
+    _, images, (*_, own, _) = examples
     frames = [image[..., 0] for image in images[:2]]
     height, width = frames[0].shape
     ends = [[-3, 9], [width, 9], [9, -3], [9, height], [0, 0], [width - 1, height - 1]]
@@ -126,7 +132,7 @@ def test_points_that_leave_the_frame_are_not_found_by_the_recipe_for_own_matches
 
 
 @pytest.mark.real
-@pytest.mark.slow
+@pytest.mark.torture
 @pytest.mark.parametrize("sequence", ["00", "05"])
 def test_the_recipe_for_own_matches_runs_on_a_whole_street(sequence, kitti_real):
     (recipe,) = (text for text in blocks(ROOT / "docs/own-data.md", "python") if "DIS" in text)

@@ -41,5 +41,5 @@ def test_the_thesis_needs_no_comparison(tiny_kitti, tmp_path):
         "from thesis_repro.command.cli import main; sys.exit(main(sys.argv[1:]))"
     )
     given = ["--kitti", tiny_kitti, "--sequence", "00", "--output", tmp_path / "path.txt"]
-    succeed([sys.executable, "-c", code, "odometry", *given], ROOT)
+    succeed([sys.executable, "-c", code, "odometry", *given], tmp_path)
     assert (tmp_path / "path.txt").read_text().count("\n") == 4

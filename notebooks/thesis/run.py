@@ -1,4 +1,4 @@
-"""Execute the notebooks of a run, and write its gallery and book: what `make figures` does.
+"""Execute the notebooks of a run, and write its gallery: what `make figures` does.
 
 This deletes what was made from other contents, and holds the lock of the run while make executes
 what is missing.
@@ -13,7 +13,7 @@ import sys
 from itertools import chain
 from pathlib import Path
 
-from thesis import book, gallery, real_frames
+from thesis import gallery, real_frames
 from thesis.run_settings import ROOT, Settings, read_settings
 from thesis_repro.checks import report
 from thesis_repro.data import cityscapes, kitti
@@ -49,7 +49,7 @@ DATA = {
 
 
 def main() -> int:
-    """Execute what is not up to date, write gallery and book, and return make's status.
+    """Execute what is not up to date, write the gallery, and return make's status.
 
     A notebook that fails does not stop those that do not need it. Raises InputError if another run
     uses the folder.
@@ -67,7 +67,8 @@ def main() -> int:
         drop_old(settings, names)
         status = _execute(settings, names)
         gallery.update(settings)
-        status = book.build(settings) or status
+    page = os.path.relpath(settings.published / "README.md")
+    print(f"to read: {page}; `make book`, with the same settings, writes pages for a browser")
     if note := network_note(settings):
         print(note)
     return status

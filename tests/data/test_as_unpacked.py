@@ -30,7 +30,6 @@ from thesis_repro.data import layout, trajectories
 from thesis_repro.data.sequence import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.masks.folders import LabelMasks, MaskFolder
-from thesis_repro.segmentation import prediction
 
 COUNT = 30
 LENSES = {
@@ -257,6 +256,8 @@ def test_masks_and_label_maps_belong_to_frames_without_distortion(
         same = source.label_map(index) == expected
         assert same.mean() > 0.999  # batches of other frames may round otherwise
     # those of raw frames do not fit, nor those of another lens
+    from thesis_repro.segmentation import prediction
+
     model = prediction.training.load_model(small_model)
     prediction.write_label_maps(model, sequence.frame_paths, tmp_path / "raw")
     with pytest.raises(InputError, match="raw: made of frames with other distortion"):

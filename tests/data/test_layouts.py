@@ -85,7 +85,7 @@ def test_the_same_drive_in_each_layout(street, tmp_path):
 @pytest.mark.real
 @pytest.mark.parametrize("name", ["06", "07"])
 def test_real_drives_in_each_layout(kitti_real, tmp_path, name):
-    real = Sequence(kitti_real, name).subset(30)
+    real = Sequence(kitti_real, name).subset(10)
     poses = np.linalg.inv(real.poses[0]) @ real.poses
     drive = Sequence.from_arrays(list(real), real.intrinsics, times=real.times, poses=poses)
     check_equal_steps(tmp_path, drive)

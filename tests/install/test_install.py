@@ -150,7 +150,7 @@ def test_make_that_only_plans_writes_nothing(checkout):
     ],
 )
 def test_a_wrong_setting_is_named_wherever_it_stands(checkout, target, options, variables, named):
-    words = ["make", "-o", ".venv/ready", target, *options]
+    words = ["make", "-o", "setup", target, *options]
     failed = run(words, checkout, **variables)
     assert failed.returncode == 2 and f"error: {named}" in failed.stderr
     assert all(
@@ -177,7 +177,7 @@ def test_two_runs_in_one_folder_are_refused(checkout):
     folders = {"PROFILE": "smoke", "BUILD": str(checkout / "b"), "FIGURES": str(checkout / "f")}
     with provenance.claimed(checkout / "b" / "embedded-smoke" / "notebooks"):
         words = [f"{name}={value}" for name, value in folders.items()]
-        second = run(["make", "-o", ".venv/ready", "figures", *words], checkout)
+        second = run(["make", "-o", "setup", "figures", *words], checkout)
     assert second.returncode == 2 and "another run uses it" in second.stderr
     assert not list((checkout / "b").rglob("*.ipynb"))
 

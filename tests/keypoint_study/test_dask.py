@@ -98,9 +98,8 @@ def test_a_cluster_gives_the_same_bits_although_a_worker_is_killed(
     pd.testing.assert_frame_equal(result.table, here.table, check_exact=True)
 
 
-@pytest.mark.parametrize(
-    "number", [pytest.param(signal.SIGKILL, marks=pytest.mark.torture), signal.SIGSTOP]
-)
+@pytest.mark.torture
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
 def test_a_scheduler_that_ends_or_hangs_is_named(tmp_path, monkeypatch, capfd, number):
     monkeypatch.setattr(workers, "TIMEOUT", 3)
     with (

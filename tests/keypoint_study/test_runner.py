@@ -20,7 +20,6 @@ from thesis_repro.masks import folders
 from thesis_repro.odometry import metrics
 from thesis_repro.odometry.keypoints import filtered
 from thesis_repro.running import program, workers
-from thesis_repro.segmentation import training
 
 WIDTHS = (5, 10, 15)
 
@@ -199,6 +198,8 @@ def test_first_jobs_are_complete_and_have_different_names(small_world, tiny_kitt
 
 
 def test_a_slow_stage_shows_in_its_row(small_world, small_model, monkeypatch):
+    from thesis_repro.segmentation import training
+
     sequence = opened(small_world)[0]
     keypoint_mask = masks.keypoint_mask
     monkeypatch.setattr(

@@ -201,7 +201,8 @@ def brought(study, tmp_path):
     return replace(study, sources=sources, widths=(), tested=None)
 
 
-def test_own_keypoints_are_rows_as_masks_are(brought, tmp_path):
+def test_own_keypoints_are_rows_as_masks_are(brought, tmp_path, monkeypatch):
+    monkeypatch.setattr(report, "figures_of", lambda *_: ())
     brought.check()
     runs = brought.run(tmp_path / "out").table
     keys = ["sequence", "repetition"]

@@ -15,7 +15,7 @@ from thesis import book, gallery
 from thesis.run_settings import read_settings
 
 NOT_RUN = NOTEBOOKS[1]
-pytestmark = [pytest.mark.notebooks, pytest.mark.slow]
+pytestmark = pytest.mark.torture
 
 
 @pytest.fixture(scope="module")

@@ -24,7 +24,7 @@ SAVED = re.compile(r"^\w+\.save_figure\(", re.MULTILINE)
 
 def make_figures(tmp_path, *options, root=ROOT):
     folders = f"BUILD={tmp_path / 'build'}", f"FIGURES={tmp_path / 'figures'}"
-    command = ["make", "figures", "PROFILE=smoke", *folders, "-o", ".venv/ready", *options]
+    command = ["make", "figures", "PROFILE=smoke", *folders, "-o", "setup", *options]
     # the options of an outer make are not for this one
     return finish(start(command, root, PYTHONPATH=root, MAKEFLAGS=None, MFLAGS=None))
 
@@ -85,9 +85,6 @@ def test_a_failing_notebook_does_not_stop_the_others(tmp_path):
     assert failed.returncode != 0 and "labels: missing" in failed.stderr
     assert "Fatal Python error: Aborted" in failed.stderr and "a copy" not in failed.stderr
     assert (tmp_path / "figures" / "embedded-smoke" / "README.md").is_file()
-    book = tmp_path / "build" / "embedded-smoke" / "book" / "html"
-    assert f"to read: {book / 'index.html'}" in failed.stdout
-    assert (book / "notebooks" / "01_load_images_and_labels.html").is_file()
     # hidden ones included
     written = (tmp_path / "build" / "embedded-smoke" / "notebooks").glob("*.ipynb")
     assert [path.name for path in written] == ["01_load_images_and_labels.ipynb"]

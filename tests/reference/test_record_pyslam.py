@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 from trials import succeed
 
+from thesis import real_frames
 from thesis_repro import odometry
 from thesis_repro.data.sequence import Sequence
 from thesis_repro.masks.folders import LabelMasks, MaskFolder
@@ -90,7 +91,7 @@ def test_it_writes_poses_and_counts_with_and_without_masks(small_world, small_la
         path = tmp_path / "pyslam" / f"{name}.py"
         path.parent.mkdir(exist_ok=True)
         path.write_text(code)
-    drive = Sequence(small_world / "kitti", "00")
+    drive = real_frames.cut(Sequence(small_world / "kitti", "00"), 0, 5, tmp_path / "cut", "00")
     of_labels = LabelMasks(small_labels / "00", drive, dilation_width=10)
     folder = tmp_path / "masks"
     folder.mkdir()
@@ -99,7 +100,7 @@ def test_it_writes_poses_and_counts_with_and_without_masks(small_world, small_la
     runs = {"all": [], "masked": [folder]}
     for name, masks in runs.items():
         output = tmp_path / f"{name}.csv"
-        command = [sys.executable, RECORDER, "pyslam", small_world / "kitti", "00", output]
+        command = [sys.executable, RECORDER, "pyslam", tmp_path / "cut", "00", output]
         succeed([*command, *masks], tmp_path)
         recorded = pd.read_csv(output)
         given = {"masks": MaskFolder(folder, drive)} if masks else {}

@@ -15,7 +15,7 @@ def words(small_world, small_labels, tmp_path):
     kitti = small_world / "kitti"
     odometry = "odometry", "--kitti", kitti, "--sequence", "00"
     study = "study", "--kitti", kitti, "--labels", small_labels, "--widths", 5, "--jobs", 2
-    make = "make", "-C", ROOT, "-o", ".venv/ready", "figures", "PROFILE=smoke"
+    make = "make", "-C", ROOT, "-o", "setup", "figures", "PROFILE=smoke"
 
     def command(name, output="out"):
         folder = tmp_path / output

@@ -48,13 +48,8 @@ def disk(tmp_path):
     subprocess.run(["umount", "-l", folder], capture_output=True)
 
 
-@pytest.mark.parametrize(
-    "name, kilobytes",
-    [
-        ("path", 0),
-        pytest.param("study", 40, marks=pytest.mark.torture),  # not in `make test`
-    ],
-)
+@pytest.mark.torture
+@pytest.mark.parametrize("name, kilobytes", [("path", 0), ("study", 40)])
 def test_a_read_only_disk_and_a_full_one(words, disk, tmp_path, name, kilobytes):
     """The error names the output; with room made, the same command resumes."""
     disk(1000, "ro")
