@@ -7,8 +7,9 @@ from pathlib import Path
 from docutils import nodes
 from docutils.utils.math.latex2mathml import tex2mathml
 
-ROOT = Path(__file__).resolve().parents[1]
-CAPTIONS = ROOT / "notebooks/thesis/captions.json"
+from thesis import gallery
+
+CITATION = (Path(__file__).parents[1] / "CITATION.cff").read_text(encoding="utf-8")
 BOOK = ""  # where the book is hosted, once it is: README then links it
 
 project = html_title = "Keypoint masks for visual odometry"
@@ -32,11 +33,15 @@ html_last_updated_fmt = None
 PICTURE = re.compile(r'(<img\b[^>]*?\bsrc="([^"]+)"[^>]*>)')
 SCROLLS = re.compile(r'<div class="(?:pst-scrollable-table-container|output text_html|equation)"')
 
-captions = json.loads(CAPTIONS.read_text(encoding="utf-8"))
-titles = {
-    each["name"]: each["title"] for chapter in captions["chapters"].values() for each in chapter
-}
 # of pages that are a table alone
+titles = {each["name"]: each["title"] for each in [*gallery.OF_THESIS, *gallery.ADDED]} | {
+    "equal_number": "Choices of keypoints at an equal number",
+    "every_second": "Few keypoints, every second frame",
+    "refined_widths": "Masks of every width, refined estimator",
+    "scores": "Label maps of the thesis's network",
+    "streets": "Streets",
+    "training": "The thesis's network",
+}
 PLACES = {"figures/kitti_excerpts": " on real frames", "figures/camvid": ", trained on CamVid"}
 
 
@@ -48,6 +53,8 @@ def in_book(app, docname, source):
     elif docname == "index":
         if not Path(app.srcdir, "results").is_dir():  # the default run's is the gallery
             source[0] = source[0].replace("/results/README\n", "")
+        for key, value in re.findall(r"(?m)^(version|date-released): (.+)", CITATION):
+            source[0] = source[0].replace(f"[{key}]", value)
     elif folder and not re.match(r"(<!--.*?-->\s*)?#", source[0], re.DOTALL):  # without a title
         title = titles.get(name, name.replace("_", " ").capitalize()) + PLACES.get(folder, "")
         source[0] = f"---\norphan: true\n---\n# {title}\n\n{source[0]}"
@@ -67,9 +74,7 @@ def lesson(name, notebook):
                     r"\]\(([\w-]+\.(?:csv|md|svg|webp))\)", r"](/figures/\1)", "".join(written)
                 )
         keys = (cell["id"], *re.findall(r'"(\w+)"', "".join(cell["source"])))
-        cell["metadata"]["seen"] = [
-            captions["seen"][key] for key in keys if key in captions["seen"]
-        ]
+        cell["metadata"]["seen"] = [gallery.SEEN[key] for key in keys if key in gallery.SEEN]
     return json.dumps(notebook)
 
 

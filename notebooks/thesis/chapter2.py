@@ -195,6 +195,30 @@ FORMULA: dict[str, Any] = {
 }
 
 
+def two_cameras() -> plt.Figure:
+    """Sketch of Equation 2.5: rays to one point from two places, and the way between these."""
+    previous, current, point = np.array([[0.0, 0.0], [3.0, 0.5], [2.4, 2.6]])
+    figure, axes = style.new_figure(height=2, width=4.6)
+    axes.set(xlim=(-1.6, 4.8), ylim=(-0.4, 2.9), aspect="equal")
+    axes.set_axis_off()
+    axes.fill(*np.transpose([previous, current, point]), color=SKY, alpha=0.25)
+    for start, end, color, formula, offset in (
+        (previous, point, GREEN, "$x_{previous}$", (-26, 6)),
+        (current, point, GREEN, "$R\\,x_{current}$", (28, 0)),
+        (previous, current, RED, "$t$", (0, -9)),
+    ):
+        _arrow(axes, start, end, color, shrinkA=3, shrinkB=3)
+        axes.annotate(formula, (start + end) / 2, offset, color=color, **FORMULA)
+    for place, text, side in (
+        (previous, "previous place ", "right"),
+        (current, " place now", "left"),
+    ):
+        axes.text(*place, text, ha=side, va="center", fontsize=8)
+    axes.text(*point, " point", va="bottom", fontsize=8)
+    axes.plot(*np.transpose([previous, current, point]), "o", color="black", markersize=4)
+    return figure
+
+
 def figure_2_09(first: np.ndarray, second: np.ndarray, title: str) -> plt.Figure:
     """Figure 2.9: the 60 ORB matches of smallest descriptor distance between two frames.
 

@@ -1,4 +1,4 @@
-"""Pictures of frames: masks, keypoints, tracks, lines, and keypoints that jump from frame to frame.
+"""Pictures of frames: masks, keypoints, tracks, and keypoints that jump from frame to frame.
 
 The thesis names such jumps as a cause of errors (Sections 4.2, 5.1).
 """
@@ -105,18 +105,6 @@ def tracks(
         ends = np.stack([old[chosen], new[chosen]], axis=1)
         axis.plot(*ends.transpose(2, 1, 0), color=color, linewidth=0.7)
     axis.set(xlim=(0, frame.shape[1]), ylim=(frame.shape[0], 0))
-    return figure
-
-
-def lines(frame: np.ndarray, coefficients: np.ndarray, points: np.ndarray) -> plt.Figure:
-    """Draw lines a u + b v + c = 0, coefficients (n, 3) in pixels, and a point (n, 2) for each."""
-    figure, (axis,) = style.frame_panels(frame)
-    style.show_image(axis, frame, f"epipolar lines of {len(points)} inliers, and the points")
-    width = frame.shape[1]
-    for (a, b, c), point in zip(coefficients, points, strict=True):
-        (line,) = axis.plot([0, width], [-c / b, -(c + a * width) / b], linewidth=0.8)
-        axis.plot(*point, "o", color=line.get_color(), markersize=4, markerfacecolor="none")
-    axis.set(xlim=(0, width), ylim=(frame.shape[0], 0))
     return figure
 
 
