@@ -6,12 +6,14 @@ release, on a quiet machine.
 """
 
 import json
+from functools import partial
 
 from keypoint_study.sources import Source
-from thesis import artefacts, few_keypoints, timing
+from thesis import few_keypoints, timing
 from thesis.run_settings import read_settings
 from thesis_repro.data import kitti
 from thesis_repro.data.sequence import Sequence
+from thesis_repro.errors import InputError
 from thesis_repro.masks import MaskSettings
 from thesis_repro.running import program
 from thesis_repro.running.files import needed
@@ -20,6 +22,8 @@ from thesis_repro.running.files import needed
 def main():
     """Measure the times that the figures of a finished run show, and write their tables."""
     settings = read_settings()
+    if settings.kitti_is_embedded and not settings.figures_in_git:
+        raise InputError("the times of the embedded world are those of the default run: no PROFILE")
     labels = needed(settings.build / "labels", "05_prediction")
     text = needed(settings.build / "masks.json", "06_keypoint_masks").read_text(encoding="utf-8")
     mask_settings = json.loads(text)
@@ -29,13 +33,10 @@ def main():
         Sequence(settings.kitti, name).subset(settings.sizes.frames)
         for name in kitti.sequences(settings.kitti)
     ]
-    shortened = [sequence.subset(settings.sizes.timed_frames) for sequence in sequences]
-    widths = sorted({*settings.sizes.widths, width})
-    timing.write(settings, "seconds", timing.seconds_of_widths(shortened, source, widths))
-    budget = timing.time_stages(sequences[0], artefacts.used_model(), width)
-    timing.write(settings, "budget", budget)
+    timing.of_run(settings, sequences, source, width, anew=True)
     if not settings.kitti_is_embedded:
-        timing.write(settings, "few_keypoints", few_keypoints.time_steps(sequences[0], labels))
+        steps = partial(few_keypoints.time_steps, sequences[0], labels)
+        timing.times(settings, "few_keypoints", steps, anew=True)
     program.summary(f"times of {timing.processor()}: {timing.folder(settings)}")
 
 

@@ -37,7 +37,7 @@ DRAWN_METHODS = {
     "masked": ("masked, best width", MASKED),
     "reduced": ("plainly reduced", REDUCED),
 }
-SQUEEZED = 3  # times the second highest sequence: a higher one breaks the axis of bars
+SQUEEZED = 3  # times as high: breaks the axis of bars, gives a panel of distances its own scale
 LINES = ["-o", "--s", "-.^", ":D"] * 3  # of up to twelve sequences, beside their colours
 BAND = "lowest to highest of the repetitions"
 # cross on a failed run (see `ratios.has_failed`), and on a mean over runs of which one failed
@@ -50,6 +50,14 @@ FAILED: dict[str, Any] = {
     "zorder": 4,
     "clip_on": False,
     "label": "failed run",
+}
+# dashed, so that a path below it is seen
+TRUE_PATH: dict[str, Any] = {
+    "color": TRUTH,
+    "linewidth": 0.8,
+    "linestyle": (0, (4, 4)),
+    "zorder": 3.5,
+    "label": "true path",
 }
 
 
@@ -102,7 +110,6 @@ def figure_4_08(windows: list[View], title: str) -> plt.Figure:
     return figure
 
 
-HIDDEN = 0.02  # of a path's extent: about the width of its line in a panel
 # what is special in the runs of a method
 SPECIAL = {"masked": ("dilation_width", ", width {:.0f}")}
 SPECIAL["reduced"] = ("max_keypoints", ", {:.0f} keypoints")
@@ -115,11 +122,11 @@ def figure_paths(
 ) -> plt.Figure:
     """Figures 4.6, 4.11, 4.12: the paths from above, and below each its distance to the truth.
 
-    Where the line of the true path hides all errors, the panel's title says so.
     truths: {sequence: ground-truth positions (n, 3)}. rows: the runs to draw, of one method;
     repetition 0 is bold, the other repetitions are faint. paths: {(sequence, run): estimated
     positions (n, 3)}. All paths of a sequence, also those of other methods, choose the limits of
-    its panels, so that the figures can be compared.
+    its panels, so that the figures can be compared. Where others would make the distances of these
+    flat, the panel has its own scale and says so.
     """
     groups = dict(iter(rows.sort_values("repetition").groupby("sequence")))
     columns = min(4, len(groups))
@@ -135,13 +142,12 @@ def figure_paths(
     errors = ratios.range_over_repetitions(rows, "rmse")
     for (above, below), (name, runs) in zip(pairs, groups.items(), strict=False):
         of_sequence = {run: path for (sequence, run), path in paths.items() if sequence == name}
-        hidden = _draw_paths(above, below, truths[name], of_sequence, runs)
+        _draw_paths(above, below, truths[name], of_sequence, runs)
         # two digits that are not zero, such as 0.0078
         mean, *span = (f"{float(f'{value:.2g}'):g}" for value in errors.loc[name])
         repeated = f" ({'-'.join(span)})" if len(runs) > 1 else ""
         column, special = SPECIAL.get(runs["method"].iloc[0], ("frames", ""))
         title = f"{name}{special.format(runs[column].iloc[0])}\n{mean}{repeated} m"
-        title += "\nhidden by the line" if hidden else "\n"
         above.set_title(title, fontsize=8)
         below.set_xlabel("way (m)", fontsize=7.5, labelpad=1)
         for panel in (above, below):
@@ -162,13 +168,12 @@ def _draw_paths(
     true: np.ndarray,
     paths: dict[str, np.ndarray],
     runs: pd.DataFrame,
-) -> bool:
+) -> None:
     """Draw the paths of runs over one sequence from above, and below their distances to the truth.
 
-    true: positions (n, 3). paths: {run: (n, 3)}, also those of other runs. Returns whether the line
-    of the true path hides all errors of these runs.
+    true: positions (n, 3). paths: {run: (n, 3)}, also those of other runs.
     """
-    above.plot(true[:, 0], true[:, 2], color=TRUTH, linewidth=3, alpha=0.3, label="true path")
+    above.plot(true[:, 0], true[:, 2], **TRUE_PATH)
     # paths meet at frame 1, as for the RMSE
     errors = {run: path - path[1] - (true - true[1]) for run, path in paths.items()}
     distances = {run: np.linalg.norm(error, axis=1) for run, error in errors.items()}
@@ -178,7 +183,7 @@ def _draw_paths(
     for run in runs.itertuples():
         line: dict[str, Any] = {"linewidth": 0.6, "alpha": 0.45, "label": "matched points shuffled"}
         if run.repetition == 0:
-            line = {"linewidth": 1.2, "alpha": 1, "label": "estimated path", "zorder": 3}
+            line = {"linewidth": 2, "alpha": 1, "label": "estimated path", "zorder": 3}
         drawn = true + errors[run.run]
         for panel, across, up in (
             (above, drawn[:, 0], drawn[:, 2]),
@@ -188,9 +193,12 @@ def _draw_paths(
             if run.failed > 0 or run.lost > 0:
                 panel.plot(across[-1], up[-1], **FAILED)
     above.set_aspect("equal", adjustable="datalim")
-    below.set_ylim(0, 1.05 * max(distance.max() for distance in distances.values()) or None)
-    extent = np.ptp(true[:, [0, 2]], axis=0).max()
-    return max(distances[run].max() for run in runs["run"]) < HIDDEN * extent
+    highest = max(distance.max() for distance in distances.values())
+    highest_drawn = max(distances[run].max() for run in runs["run"])
+    if highest > SQUEEZED * highest_drawn:
+        highest = highest_drawn
+        below.set_title("own scale", fontsize=6.5, loc="right", pad=2)
+    below.set_ylim(0, 1.05 * highest or None)
 
 
 def figure_against_width(masked: pd.DataFrame, baseline: pd.DataFrame, metric: str) -> plt.Figure:
@@ -204,23 +212,15 @@ def figure_against_width(masked: pd.DataFrame, baseline: pd.DataFrame, metric: s
     label = f"{metric.upper()} (m)"
     rows = -(-len(names) // 4)
     # Any, because subfigures may also return a single one
-    figure: Any = plt.figure(figsize=(PAGE_WIDTH, 3.8 + 1.35 * rows), layout="constrained")
-    above, below = figure.subfigures(2, 1, height_ratios=[3.2, 1.35 * rows + 0.6])
-    axes = above.subplots()
+    figure: Any = plt.figure(figsize=(PAGE_WIDTH, 4.8 + 1.35 * rows), layout="constrained")
+    above, below = figure.subfigures(2, 1, height_ratios=[4.2, 1.35 * rows + 0.6])
     errors = ratios.range_over_repetitions(masked, metric, by=["sequence", "dilation_width"])
-    lines = errors["mean"].unstack("sequence")
-    lines.plot(ax=axes, style=LINES, markersize=3.5, xticks=lines.index)
-    style.ratio_axis(axes.yaxis, lines.to_numpy())
-    axes.legend(loc="upper left", bbox_to_anchor=(1, 1))
     failed = ratios.has_failed(masked).groupby([masked["sequence"], masked["dilation_width"]])
     crosses = errors["mean"][failed.any()]
-    for (_, width), error in crosses.items():
-        axes.plot(width, error, **FAILED)
-    axes.set(
-        xlabel="dilation width (pixels)",
-        ylabel=label,
-        title=f"{metric.upper()} against dilation width, by sequence",
-    )
+    lines = errors["mean"].unstack("sequence")
+    _draw_lines(above, lines, crosses)
+    above.suptitle(f"{metric.upper()} against dilation width, by sequence", fontsize=9)
+    above.supylabel(label, fontsize=9)
     of_all = ratios.range_over_repetitions(baseline, metric)
     _, panels = views.small_panels(names, "width (pixels)", below)
     for panel, name in zip(panels, names, strict=True):
@@ -254,6 +254,29 @@ def figure_against_width(masked: pd.DataFrame, baseline: pd.DataFrame, metric: s
     below.supylabel(label, fontsize=8)
     style.legend_below(below, panels, 2)
     return figure
+
+
+def _draw_lines(figure: Any, lines: pd.DataFrame, crosses: pd.Series) -> None:
+    """Draw errors against the width, in two panels: on one axis, most lines would meet.
+
+    lines: one column a sequence, half of which have the lower panel for their lower errors.
+    crosses: the means with a failed run in them, by sequence and width.
+    """
+    looks = dict(zip(lines, zip(LINES, style.LINE_COLORS * 2)))
+    names = list(lines.median().sort_values(ascending=False).index)
+    halves = [sorted(half) for half in np.array_split(names, min(2, len(names)))]
+    panels = figure.subplots(len(halves), 1, sharex=True, squeeze=False)[:, 0]
+    for panel, half in zip(panels, halves, strict=True):
+        marks, colors = zip(*(looks[name] for name in half))
+        lines[half].plot(
+            ax=panel, style=list(marks), color=colors, markersize=3.5, xticks=lines.index
+        )
+        style.ratio_axis(panel.yaxis, lines[half].to_numpy())
+        panel.legend(loc="upper left", bbox_to_anchor=(1, 1))
+        for (name, width), error in crosses.items():
+            if name in half:
+                panel.plot(width, error, **FAILED)
+    panels[-1].set_xlabel("dilation width (pixels)")
 
 
 def mark_failed(axes: plt.Axes, failed: pd.DataFrame) -> None:
@@ -336,3 +359,18 @@ def panels_of_bars(runs: pd.DataFrame, metric: str) -> plt.Figure:
     figure.supylabel(f"{metric.upper()} (m)", fontsize=8)
     style.legend_below(figure, panels, 4)
     return figure
+
+
+def figures_beside(
+    masked: pd.DataFrame, baseline: pd.DataFrame, of_methods: pd.DataFrame
+) -> dict[str, plt.Figure]:
+    """Return Figures 4.10 and 4.14 to 4.16, which repeat others for the MAE or by sequence.
+
+    masked, baseline: as for `figure_against_width`. of_methods: as for `bars`.
+    """
+    return {
+        "figure_4_10": figure_against_width(masked, baseline, "mae"),
+        "figure_4_14": panels_of_bars(of_methods, "rmse"),
+        "figure_4_15": figure_of_bars(of_methods, "mae"),
+        "figure_4_16": panels_of_bars(of_methods, "mae"),
+    }

@@ -5,8 +5,9 @@ The widths are timed as in the thesis (Figure 4.17). The stages include the netw
 image at a time, all cores.
 
 Figures and tables in git have the times of git, which `make timings` measures anew: those of the
-default run in figures/timings, those of the evidence in figures/kitti_excerpts/timings. So a run on
-another machine changes no sentence. Other frames are timed once, in the folder of their figures.
+embedded world in figures/timings, which all its runs show, those of the evidence in
+figures/kitti_excerpts/timings. So a run on another machine changes no sentence. Other frames are
+timed once, in the folder of their figures.
 """
 
 import platform
@@ -28,7 +29,7 @@ from keypoint_study.best_width import percent_change
 from keypoint_study.jobs import CONTROL_WIDTH
 from keypoint_study.report import style
 from keypoint_study.sources import Source
-from thesis import REPORTED, real_frames
+from thesis import REPORTED, artefacts, real_frames
 from thesis.run_settings import ROOT, Settings, cores
 from thesis_repro import masks, odometry
 from thesis_repro.data.cityscapes import resize_bilinear
@@ -39,8 +40,6 @@ from thesis_repro.running.files import needed, progress, write_text
 
 TURNS = 2  # of each run, of which the fastest counts
 FRAMES = 20  # on which the stages are timed
-# of the leader from a line to its name
-ENDS: dict[str, Any] = {"relpos": (0, 0.5), "shrinkA": 0, "shrinkB": 3}
 WARM_UP = 3  # frames before them, which load compiled code and fill caches
 
 
@@ -110,13 +109,11 @@ def figure_4_17(seconds: pd.DataFrame, embedded: bool) -> plt.Figure:
     )
     thread = together.columns[0]
     if count > 1:
-        ends = {}
-        for name, rows in seconds.groupby("sequence"):
-            line = time_savings(rows)[thread].to_numpy()
-            label = f"a single sequence, {thread}"
-            axes.plot(line, ".-", color="#666666", markersize=4, linewidth=0.4, label=label)
-            ends[name] = line[-1]
-        _name_ends(axes, ends, len(together) - 1)
+        of_each = {name: time_savings(rows)[thread] for name, rows in seconds.groupby("sequence")}
+        middles = [bar.get_x() + bar.get_width() / 2 for bar in axes.patches[: len(together)]]
+        dots: dict[str, Any] = {"color": "black", "markersize": 4, "alpha": 0.5}
+        dots |= {"markeredgewidth": 0, "label": f"a single sequence, {thread}"}
+        axes.plot(middles, pd.DataFrame(of_each), "o", **dots)
     if not embedded:
         least, most = REPORTED["headline_claims"]["time_savings_percent"]
         claim = f"the thesis, on KITTI: {least} to {most} % saved with its best widths"
@@ -125,27 +122,6 @@ def figure_4_17(seconds: pd.DataFrame, embedded: bool) -> plt.Figure:
     axes.set(xlabel="dilation width (pixels)", ylabel="change of time (%)")
     style.legend_below(figure, [axes], 2)
     return figure
-
-
-def _name_ends(axes: plt.Axes, ends: dict[str, float], last: int) -> None:
-    """Write the names of lines at their right ends, with room between them."""
-    low, high = axes.get_ylim()
-    room = (high - low) / 17
-    names = sorted(ends, key=lambda name: ends[name])
-    heights: list[float] = []
-    for name in names:
-        heights.append(max(ends[name], heights[-1] + room) if heights else ends[name])
-    above = max(0, heights[-1] - ends[names[-1]]) / 2  # what all were pushed up, shared
-    for name, height in zip(names, heights, strict=True):
-        axes.annotate(
-            name,
-            (last, ends[name]),
-            (last + 0.8, height - above),
-            fontsize=7,
-            va="center",
-            arrowprops={"arrowstyle": "-", "color": "#999999", "linewidth": 0.4} | ENDS,
-            annotation_clip=False,
-        )
 
 
 def time_stages(
@@ -205,7 +181,7 @@ def table_of_stages(stages: pd.DataFrame) -> pd.DataFrame:
 
 def folder(settings: Settings) -> Path:
     """Return the folder of the times that a run's figures show: in git for figures in git."""
-    if settings.figures_in_git:
+    if settings.kitti_is_embedded:
         return ROOT / "figures" / "timings"
     if real_frames.is_evidence(settings):
         return real_frames.FOLDER / "timings"
@@ -213,23 +189,37 @@ def folder(settings: Settings) -> Path:
 
 
 def times(
-    settings: Settings, name: str, measure: Callable[[], pd.DataFrame] | None = None
+    settings: Settings,
+    name: str,
+    measure: Callable[[], pd.DataFrame] | None = None,
+    anew: bool = False,
 ) -> pd.DataFrame:
     """Return the times that a run's figures show, and what `told` tells of them.
 
-    measure: measures them, if the frames of the run were never timed; then they are written.
+    measure: measures them, if the frames of the run were never timed, or anew; then they are
+    written. Raises InputError if there are none.
     """
     path = folder(settings) / f"{name}.csv"
-    if measure and not path.is_file():
-        write(settings, name, measure())
+    if measure and (anew or not path.is_file()):
+        table = measure().assign(**circumstances(settings))
+        write_text(path, table.to_csv(index=False, lineterminator="\n", float_format="%.6g"))
     return pd.read_csv(needed(path, "08_results"), dtype={"sequence": str})
 
 
-def write(settings: Settings, name: str, measured: pd.DataFrame) -> None:
-    """Write times where a run's figures find them, with where, when and on what they were taken."""
-    table = measured.assign(**circumstances(settings))
-    text = table.to_csv(index=False, lineterminator="\n", float_format="%.6g")
-    write_text(folder(settings) / f"{name}.csv", text)
+def of_run(
+    settings: Settings, sequences: list[Sequence], source: Source, width: int, anew: bool = False
+) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Return `times` of a run: of `seconds_of_widths`, and of `time_stages`.
+
+    source: of the masks. width: pixels, of the masks in the stages.
+    """
+    shortened = [sequence.subset(settings.sizes.timed_frames) for sequence in sequences]
+    widths = sorted({*settings.sizes.widths, width})
+    seconds = times(settings, "seconds", lambda: seconds_of_widths(shortened, source, widths), anew)
+    stages = times(
+        settings, "budget", lambda: time_stages(sequences[0], artefacts.used_model(), width), anew
+    )
+    return seconds, stages
 
 
 def circumstances(settings: Settings) -> dict[str, str]:

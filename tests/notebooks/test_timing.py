@@ -14,8 +14,10 @@ MEASURED = pd.DataFrame({"sequence": ["00"], "seconds": [0.25]})
 
 @pytest.fixture
 def settings(tmp_path):
-    """Of a run whose figures are not in git."""
-    names = {"PROFILE": "smoke", "BUILD": tmp_path / "build", "FIGURES": tmp_path / "figures"}
+    """Of a run on frames of the user's, whose figures are not in git."""
+    (tmp_path / "kitti").mkdir()
+    names = {name: tmp_path / name.lower() for name in ("KITTI", "BUILD", "FIGURES")}
+    names["PROFILE"] = "smoke"
     return read_settings({f"THESIS_REPRO_{name}": str(value) for name, value in names.items()})
 
 
@@ -26,14 +28,18 @@ def test_frames_are_timed_once_with_machine_date_version_and_sizes(settings):
     assert table["seconds"].tolist() == [0.25] and table["sequence"].tolist() == ["00"]
     for name, text in timing.circumstances(settings).items():
         assert table[name].tolist() == [text] and text in timing.told(table)
-    assert timing.times(settings, "seconds", lambda: MEASURED.assign(seconds=1)).equals(table)
+    again = MEASURED.assign(seconds=1.0)
+    assert timing.times(settings, "seconds", lambda: again).equals(table)
+    assert timing.times(settings, "seconds", lambda: again, anew=True)["seconds"].tolist() == [1]
 
 
-@pytest.mark.parametrize("is_evidence", [False, True])
-def test_what_a_machine_measures_changes_no_figure_in_git(monkeypatch, tmp_path, is_evidence):
-    settings = read_settings({"THESIS_REPRO_BUILD": str(tmp_path / "build")})
-    if is_evidence:
-        settings = read_settings({"THESIS_REPRO_PROFILE": "thesis"})
+@pytest.mark.parametrize("run", ["demo", "smoke", "evidence"])
+def test_what_a_machine_measures_changes_no_figure_in_git(monkeypatch, tmp_path, run):
+    names = {"THESIS_REPRO_BUILD": str(tmp_path / "build"), "THESIS_REPRO_PROFILE": run}
+    if run == "evidence":
+        names |= {"THESIS_REPRO_PROFILE": "thesis", "THESIS_REPRO_KITTI": str(tmp_path)}
+    settings = read_settings(names)
+    if run == "evidence":
         monkeypatch.setattr(real_frames, "is_evidence", lambda _: True)
         monkeypatch.setattr(real_frames, "FOLDER", tmp_path)
         (tmp_path / "timings").mkdir()
