@@ -17,7 +17,7 @@ import pandas as pd
 from keypoint_study import comparisons, jobs, ratios, runner
 from keypoint_study.report import style, texts
 from keypoint_study.sources import Source
-from thesis import chapter4, few_keypoints, real_frames, tables, timing
+from thesis import few_keypoints, real_frames, timing
 from thesis.run_settings import read_settings
 from thesis_repro.data import kitti
 from thesis_repro.data.sequence import Sequence
@@ -29,7 +29,7 @@ from thesis_repro.running.files import needed, write_text
 FOLDER = real_frames.FOLDER
 # Figures and tables of notebooks 8 and 9. Other notebooks draw frames, which are not ours to give.
 KEPT = (
-    *(f"figure_4_{number:02d}" for number in (6, 7, 9, 10, 11, 12, 17)),
+    *(f"figure_4_{number:02d}" for number in (6, 7, *range(9, 18))),
     *(f"table_4_{number}" for number in (1, 2, 3)),
     "comparison",
     "widths",
@@ -116,7 +116,6 @@ def write(settings, folder):
         # six digits are enough: shuffling the matched points changes more
         text = rows.to_csv(index=False, lineterminator="\n", float_format="%.6g")
         write_text(folder / f"{name}.csv", text)
-    draw(folder)
     findings = needed(settings.figures / "findings.md", "08_results").read_text(encoding="utf-8")
     write_text(
         folder / "README.md",
@@ -131,29 +130,6 @@ def write(settings, folder):
             },
         ),
     )
-
-
-@style.applied()
-def draw(folder):
-    """Draw what tables of the evidence show: Figures 4.13 to 4.16, and 4.17 if times are there."""
-    note = (folder / "table_4_1.md").read_text(encoding="utf-8").splitlines()[-1]
-    runs = pd.read_csv(folder / "runs.csv", dtype={"sequence": str}, low_memory=False)
-    runs = runs[runs["estimator"] == "thesis"]
-    best = tables.of_chosen_width(runs[runs["method"] == "masked"])
-    shown = pd.concat([runs[runs["method"].isin(["baseline", "reduced"])], best])
-    figures = {
-        "figure_4_13": chapter4.figure_of_bars(shown, "rmse"),
-        "figure_4_14": chapter4.panels_of_bars(shown, "rmse"),
-        "figure_4_15": chapter4.figure_of_bars(shown, "mae"),
-        "figure_4_16": chapter4.panels_of_bars(shown, "mae"),
-    }
-    for name, figure in figures.items():
-        style.save_figure(figure, folder, name, note)
-    times = folder / "timings" / "seconds.csv"
-    if times.is_file():
-        seconds = pd.read_csv(times, dtype={"sequence": str})
-        figure = timing.figure_4_17(seconds, embedded=False)
-        style.save_figure(figure, folder, "figure_4_17", f"{note}; {timing.told(seconds)}")
 
 
 def _read(settings, name):

@@ -37,21 +37,23 @@ TIMED_RUNS = 5
 CALLED = {"baseline": "all", "strongest-on": "mask", "spread-anywhere": "spread"}
 # {name in the tables: title}
 LABELS = {CALLED.get(name, name): METHODS[name].title for name in ("baseline", *of_group(FEW))}
-# choices and numbers that are run with every second frame, too
+# choices and numbers (0: no limit) of notebook 8, which compares them at one number
+AT_200 = (
+    ("all", 0),
+    *((name, 200) for name in ("strongest", "random", "spread", "mask", "random-on")),
+)
+# those that are run with every second frame, too
 EVERY_SECOND = (("all", 0), ("mask", 0), ("spread", 200))
 NEAR = 0.8, 1.5  # of the panels that show ratios near 1 enlarged
 
 
-def jobs_of(sequence: Sequence, numbers: Iterable[int] = ()) -> dict[tuple[str, int], Job]:
-    """Return {(choice, number of keypoints asked for, 0 for no limit): a job}.
-
-    numbers: NUMBERS if there are none.
-    """
+def jobs_of(sequence: Sequence) -> dict[tuple[str, int], Job]:
+    """Return {(choice, number of keypoints asked for, 0 for no limit): a job}."""
     few = of_group(FEW)
     asked = [("baseline", 0), ("strongest-on", 0)]
     asked += [(name, 0) for name in few if not METHODS[name].numbered]
     each = [name for name in few if METHODS[name].numbered and name != "random-on"]
-    asked += [(name, number) for number in numbers or NUMBERS for name in each]
+    asked += [(name, number) for number in NUMBERS for name in each]
     asked.append(("random-on", 200))
     return {
         (CALLED.get(name, name), number): Job(sequence.name, name, max_keypoints=number)
@@ -65,19 +67,18 @@ def run_few(
     folder: Path,
     processes: int = 1,
     repetitions: int = REPETITIONS,
-    numbers: Iterable[int] = (),
     only: Collection[tuple[str, int]] = (),
 ) -> pd.DataFrame:
     """Run all choices on sequences. Returns one row a run; finished runs are not repeated.
 
-    labels: a folder with one folder of label maps a sequence. folder: of the results. numbers: of
-    keypoints, NUMBERS if there are none. only: (choice, number) of those that are run, all if none.
+    labels: a folder with one folder of label maps a sequence. folder: of the results. only:
+    (choice, number) of those that are run, all if none.
     """
     sequences = list(sequences)
     listed = [
         job
         for sequence in sequences
-        for key, job in jobs_of(sequence, numbers).items()
+        for key, job in jobs_of(sequence).items()
         if not only or key in only
     ]
     runs = runs_of(repeated(listed, COMPARED, repetitions), sequences, [Source(labels)])

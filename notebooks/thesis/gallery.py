@@ -46,6 +46,7 @@ def _added() -> list[dict[str, Any]]:
 
 
 ADDED = _added()
+OF_EVIDENCE = _CAPTIONS["evidence"]  # on real frames alone
 # what is to be seen, {name of a figure, or id of a notebook's cell: alternative text}
 SEEN = _CAPTIONS["seen"]
 OF_THESIS = [*chain(*CHAPTERS.values())]
@@ -115,6 +116,7 @@ def text(settings: Settings) -> str:
 def _of_real_frames(settings: Settings) -> list[dict[str, Any]]:
     """Return the described artefacts of the evidence on real frames that is in git."""
     chapter = [*CHAPTERS["Chapter 4: results"]]
+    chapter += OF_EVIDENCE
     for names in (["few_keypoints"], ["comparison", "widths"]):
         chapter += [artefact for artefact in ADDED if artefact["name"] in names]
     real = replace(settings, kitti_is_embedded=False)

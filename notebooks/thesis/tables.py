@@ -22,8 +22,8 @@ from keypoint_study.best_width import (
     stability,
 )
 from keypoint_study.jobs import Job, repeated
-from keypoint_study.report import findings, style, texts
-from thesis import REPORTED, artefacts, map_quality
+from keypoint_study.report import comparison, findings, style, texts
+from thesis import REPORTED, artefacts, map_quality, timing
 from thesis.run_settings import Settings
 from thesis_repro.running.files import write_text
 
@@ -207,7 +207,7 @@ def _summary_of_studies(studies: pd.DataFrame) -> dict[str, float]:
     }
 
 
-# Notebook 08: notes and findings
+# Notebook 08: notes, and what the gallery has beside
 
 
 def notes(settings: Settings, runs: pd.DataFrame, mask_settings: dict[str, Any]) -> tuple[str, str]:
@@ -225,16 +225,22 @@ def notes(settings: Settings, runs: pd.DataFrame, mask_settings: dict[str, Any])
     return f"{note}; {lengths}", "thesis, complete KITTI sequences"
 
 
-def write_findings(
+def save_beside(
     settings: Settings,
     runs: pd.DataFrame,
     compared: pd.DataFrame,
+    stages: pd.DataFrame,
     note: str,
-) -> str:
-    """Write the findings of a run (`findings.findings_of`) beside the figures, and return them.
+) -> None:
+    """Save what the gallery has beside chapter 4: three tables, and the findings.
 
-    compared: `comparisons_of` the runs.
+    compared: `comparisons_of` the runs. stages: of `timing.of_run`.
     """
+    pairs = comparison.table_of_ratios(comparison.all_of(compared))
+    artefacts.save_table(pairs, "comparison", note=note)
+    artefacts.save_table(comparison.table_of_widths(runs).content, "widths", note=note)
+    timed_on = f"{note}; {timing.told(stages)}"
+    artefacts.save_table(timing.table_of_stages(stages), "budget", note=timed_on)
     quality = map_quality.label_map_quality(settings.build).round(3)
     quality = quality.filter(["domain", "images", "classes", "mean_iou", "seen"])
     more = texts.render(
@@ -243,4 +249,3 @@ def write_findings(
     )
     text = findings.findings_of(runs, compared, note, settings.kitti_is_embedded, more)
     write_text(settings.figures / "findings.md", text)
-    return text

@@ -425,21 +425,31 @@ def streets():
     ]
 
 
-@pytest.mark.parametrize("metric", ["rotation", "rmse"])
-def test_exercise_08_1(streets, metric):
-    names = {"np": np, "pd": pd, "stats": stats, "comparisons": comparisons, "METRIC": metric}
-    names = run("08", "38 39 51", runs=streets[0], **names)
-    assert names["by_hand"] == pytest.approx(names["ratio"], rel=1e-9)
-    inside = names["p_values"][1:3]
-    assert min(inside) > 0.05 >= max(names["p_values"][0], names["p_values"][3])
-    assert set(names["answers"].index) == {"se3", "rotation", "rmse"}
+def test_exercise_08_1(streets):
+    names = {"runs": streets[0], "tables": tables, "pd": pd}
+    names = run("08", "58", **names)
+    by_hand = {
+        metric: run("08", "31", **(names | {"METRIC": metric}))["by_hand"]
+        for metric in ("rmse", "mae", "se3")
+    }
+    for metric in ("rmse", "mae"):
+        parts = names["masked"], names["baseline"], streets[1]
+        table = tables.table_of_change(*parts, metric, "thesis").set_index("sequence")
+        package = table.loc[by_hand[metric].index, "change (%)"]
+        assert by_hand[metric].to_numpy() == pytest.approx(package.to_numpy(), abs=0.006)
+    assert by_hand["se3"].median() > by_hand["rmse"].median()
 
 
 def test_exercise_08_2(streets):
     runs, shuffled = streets
-    widths = tuple(sorted(runs["dilation_width"].dropna().unique()))
+    masked, baseline = (
+        comparisons.of_method(runs, name, "thesis") for name in ("masked", "baseline")
+    )
+    widths = tuple(sorted(masked["dilation_width"].unique()))
     names = {"tables": tables, "shuffled": shuffled, "pd": pd}
-    means = list(run("08", "53", WIDTHS=widths, **names)["means"].values())
+    names |= {"masked": masked, "baseline": baseline, "WIDTHS": widths}
+    studies = run("08", "53", **names)["studies"]
+    means = [values[0] for name, values in studies.items() if name.startswith("nothing")]
     assert means == sorted(means, reverse=True) and means[0] > -1 and means[-1] < -10
 
 

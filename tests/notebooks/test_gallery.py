@@ -62,10 +62,12 @@ def test_missing_artefacts_are_listed_with_the_data_that_they_need(run):
 
 
 def test_each_artefact_is_saved_by_a_notebook_and_has_files_in_git():
-    named = set(re.findall(r'"(\w+)"', "".join(map(code_of, NOTEBOOKS))))
+    code = "".join(map(code_of, NOTEBOOKS))
+    code += "".join(path.read_text() for path in (ROOT / "notebooks/thesis").glob("*.py"))
+    named = set(re.findall(r'"(\w+)"', code))
     names = {artefact["name"] for artefact in ARTEFACTS if artefact["kind"] != "text"}
     assert names - named == set()
-    assert {name for name in named if re.match(r"(figure|table)_\w_\d", name)} <= names
+    assert {name for name in named if re.match(r"(figure|table)_\w_\d+$", name)} <= names
     assert [name for name in names if not list((ROOT / "figures").glob(f"{name}.*"))] == []
 
 

@@ -61,7 +61,6 @@ def test_evidence_keeps_what_shows_no_frame(executed, tmp_path, monkeypatch):
         "refined_widths",
         "refined_widths_runs",
         "few_keypoints_runs",
-        *(f"figure_4_{number}" for number in range(13, 17)),
         *evidence.KEPT,
         *evidence.RUNS,
     }

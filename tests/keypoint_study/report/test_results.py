@@ -9,10 +9,10 @@ import pandas as pd
 import pytest
 from cells import cells
 
-from keypoint_study import comparisons, ratios, verdicts
+from keypoint_study import comparisons, verdicts
 from keypoint_study.path_errors import ERRORS
 from keypoint_study.report import comparison, findings, html, style, texts
-from thesis import REPORTED, chapter4, few_keypoints, tables, views
+from thesis import REPORTED, chapter4, few_keypoints, tables
 from thesis_repro.errors import one_line
 
 ELEVEN = [f"{number:02d}" for number in range(11)]
@@ -187,13 +187,14 @@ def test_figures_of_equal_and_of_noisy_errors_can_be_drawn(names, noise, sources
         save = SimpleNamespace(
             save_figure=lambda figure, name, note: figures.update({name: figure})
         )
-        given = {"runs": runs, "SEQUENCES": sorted(runs["sequence"].unique()), "note": ""}
-        modules = {"np": np, "pd": pd, "chapter4": chapter4, "views": views, "style": style}
-        modules |= {"tables": tables, "comparisons": comparisons, "ratios": ratios}
-        given |= modules | {"artefacts": save}
-        for number in ("58", "54", "18", "55", "56", "26", "27", "80", "82"):
+        given = {"runs": runs, "note": "", "artefacts": save, "tables": tables, "pd": pd}
+        given |= {"chapter4": chapter4, "style": style}
+        for number in ("58", "18", "26"):
             exec(cells("08_results.ipynb", "code")[f"08-{number}"], given)
-        assert set(figures) == {f"figure_4_{number:02d}" for number in (7, 13, 14, 15, 16)}
+        figures |= chapter4.figures_beside(given["masked"], given["baseline"], given["of_methods"])
+        for drawn in figures.values():
+            drawn.draw_without_rendering()
+        assert set(figures) == {f"figure_4_{number:02d}" for number in (7, 10, 13, 14, 15, 16)}
     figure = comparison.figure_of_ratios(table).content
     figure.draw_without_rendering()
     assert all(edge > 0 for axes in figure.axes for edge in axes.get_xlim())
@@ -215,6 +216,34 @@ def test_the_comparison_figure_shows_ratios_and_their_interval():
     assert marker.get_xdata() == pytest.approx([row["ratio"]])
     # so that the ends of an interval shorter than the marker are seen
     assert interval.get_markersize() > 1.5 * marker.get_markersize()
+
+
+def test_a_path_that_others_make_flat_has_its_own_scale():
+    straight = np.arange(10.0)[:, None] * [0, 0, 1]
+    sideways = np.linspace(0, 1, 10)[:, None] * [1, 0, 0]
+    paths = {("00", "near"): straight + 0.1 * sideways, ("00", "far"): straight + 9 * sideways}
+    paths[("00", "middle")] = straight + 4 * sideways
+    row = {"sequence": "00", "method": "baseline", "repetition": 0, "frames": 10, "rmse": 0.1}
+    row |= {"failed": 0, "lost": 0}
+    heights = {}
+    for run in ("near", "middle", "far"):
+        rows = pd.DataFrame([row | {"run": run}])
+        _, below = chapter4.figure_paths({"00": straight}, rows, paths).axes
+        heights[run] = below.get_ylim()[1], below.get_title(loc="right") != ""
+    own, shared = (1.05 * end * 8 / 9 for end in (0.1, 9))  # paths meet at frame 1
+    assert heights["near"] == (pytest.approx(own), True)
+    assert heights["middle"] == heights["far"] == (pytest.approx(shared), False)
+
+
+def test_each_line_over_the_width_is_drawn_once_the_low_ones_apart():
+    masked, baseline = widths_of(runs_of(ELEVEN, halved))
+    figure = chapter4.figure_against_width(masked, baseline, "rmse")
+    high, low = figure.subfigs[0].axes
+    drawn = [[line.get_label() for line in panel.lines] for panel in (high, low)]
+    assert drawn == [ELEVEN[5:], ELEVEN[:5]]
+    for name, line in zip(drawn[0] + drawn[1], high.lines[:] + low.lines[:], strict=True):
+        means = masked[masked["sequence"] == name].groupby("dilation_width")["rmse"].mean()
+        assert list(line.get_ydata()) == pytest.approx(list(means))
 
 
 def test_the_curve_of_few_keypoints_shows_every_ratio():
