@@ -257,16 +257,17 @@ def figure_against_width(masked: pd.DataFrame, baseline: pd.DataFrame, metric: s
 
 
 def _draw_lines(figure: Any, lines: pd.DataFrame, crosses: pd.Series) -> None:
-    """Draw errors against the width, in two panels: on one axis, most lines would meet.
+    """Draw errors against the width. On one axis, more than four lines would meet.
 
-    lines: one column a sequence, half of which have the lower panel for their lower errors.
+    lines: one column a sequence; the half with lower errors has the lower one of two panels.
     crosses: the means with a failed run in them, by sequence and width.
     """
     looks = dict(zip(lines, zip(LINES, style.LINE_COLORS * 2)))
     names = list(lines.median().sort_values(ascending=False).index)
-    halves = [sorted(half) for half in np.array_split(names, min(2, len(names)))]
-    panels = figure.subplots(len(halves), 1, sharex=True, squeeze=False)[:, 0]
-    for panel, half in zip(panels, halves, strict=True):
+    count = 2 if len(names) > 4 else 1
+    panels = figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0]
+    for panel, part in zip(panels, np.array_split(names, count), strict=True):
+        half = sorted(part)
         marks, colors = zip(*(looks[name] for name in half))
         lines[half].plot(
             ax=panel, style=list(marks), color=colors, markersize=3.5, xticks=lines.index
