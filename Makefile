@@ -102,10 +102,11 @@ torture: setup
 	@$(BIN)/python -m pytest -q -m torture
 lint: setup
 	@$(BIN)/ruff format --check --quiet . && $(BIN)/ruff check . && $(BIN)/mypy && $(BIN)/lint-imports --no-logo --no-cache
-# Lessons edit copies, so that the notebooks in git stay as they are. An edited copy is kept.
+# Lessons edit copies, so that the notebooks in git stay as they are. An edited copy is kept. They link docs and figures.
 lab: setup
 	@lab=$$($(BIN)/python -m thesis.run_settings) && lab=$${lab%/*}/lab && mkdir -p "$$lab" && \
 	for path in notebooks/0[1-9]_*.ipynb notebooks/thesis; do test -e "$$lab/$${path#*/}" || cp -r "$$path" "$$lab"; done && \
+	ln -sfn "$(CURDIR)/docs" "$(CURDIR)/figures" "$$lab" && \
 	echo "the notebooks are copies in $$lab; delete one to get it anew. One that was idle for an hour loses its memory:" && \
 	echo "run its cells again. Open the address below:" && \
 	THESIS_REPRO_PROFILE=$(or $(THESIS_REPRO_PROFILE),lab) PYTHONPATH="$(CURDIR)" $(BIN)/python -m jupyter lab "$$lab" --log-level=ERROR \

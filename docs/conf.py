@@ -42,7 +42,11 @@ titles = {each["name"]: each["title"] for each in [*gallery.OF_THESIS, *gallery.
     "streets": "Streets",
     "training": "The thesis's network",
 }
-PLACES = {"figures/kitti_excerpts": " on real frames", "figures/camvid": ", trained on CamVid"}
+PLACES = {
+    "figures/kitti_excerpts": " (real frames)",
+    "figures/camvid": " (trained on CamVid)",
+    "results": " (this run)",
+}
 
 
 def in_book(app, docname, source):

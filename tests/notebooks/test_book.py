@@ -85,6 +85,8 @@ def test_every_link_of_a_lesson_leads_to_a_page_or_a_file(pages, settings):
 def test_pages_have_titles_and_one_explains_each_public_name(pages):
     titles = {name: page.h1.get_text().rstrip("#") for name, page in pages.items() if page.h1}
     assert titles["figures/table_4_1"] == "Best dilation width"
-    assert titles["figures/kitti_excerpts/table_4_1"] == "Best dilation width on real frames"
+    assert titles["figures/kitti_excerpts/table_4_1"] == "Best dilation width (real frames)"
+    assert len({*titles.values()}) == len(titles)
+    assert "version = {[" not in pages["index"].get_text()
     explained = {each["id"].split(".")[1] for each in pages["docs/reference"].select("dt[id]")}
     assert {*tr.__all__} - {"THESIS", "metrics", "Masks"} <= explained
