@@ -11,6 +11,9 @@ os.environ |= dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"), "1"
 )
 
+# settings of another Keras, as a user may have them, do no harm
+os.environ |= {"TF_USE_LEGACY_KERAS": "1", "KERAS_BACKEND": "jax", "SM_FRAMEWORK": "keras"}
+
 from thesis_repro import segmentation  # noqa: F401  sets what TensorFlow reads at its import
 
 # isort: split
@@ -19,6 +22,8 @@ import numpy as np
 import pytest
 import trials
 from joblib import cpu_count
+
+from thesis_repro.odometry import runs
 
 # The files that take longest, longest first. The evidence waits for the notebooks, which the first
 # file executes.
@@ -82,6 +87,13 @@ def pytest_collection_finish():
     # spares a tenth of the time: garbage is looked for more rarely, and not in modules
     gc.freeze()
     gc.set_threshold(20_000)
+
+
+@pytest.fixture(autouse=True)
+def short_runs_take_faster_calls(request, monkeypatch):
+    """They have the bits of OpenCV's, as the tests of the odometry show, which take OpenCV's."""
+    if request.path.parent.name != "odometry":
+        monkeypatch.setattr(runs, "FRAMES_TO_LOAD", 1)
 
 
 def _real_data(*parts):

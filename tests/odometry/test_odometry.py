@@ -338,7 +338,7 @@ def test_bad_frames_are_flagged_and_keep_the_pose(drive, case):
     change, settings, empty, expected = BAD[case]
     sequence = change(drive)
     masks = [BLACK if index in empty else ~BLACK for index in range(len(sequence))]
-    result = odometry.run(sequence, replace(THESIS, **settings), masks)
+    result = odometry.run(sequence, replace(SMALL, **settings), masks)
     assert flags(result) == expected
     np.testing.assert_array_equal(result.poses[0], odometry.start_pose(sequence))
     for index, moved in result.frames["updated"][1:].items():
@@ -347,7 +347,7 @@ def test_bad_frames_are_flagged_and_keep_the_pose(drive, case):
         assert np.array_equal(result.poses[index], result.poses[index - 1]) != moved
     if case == "equal frames":  # the path is that without them
         kept = np.delete(result.poses, [1, 5, 6], axis=0)
-        np.testing.assert_array_equal(kept, odometry.run(drive).poses)
+        np.testing.assert_array_equal(kept, odometry.run(drive, SMALL).poses)
         assert result.failed_steps == 0
     if case in (
         "black and blown out",
@@ -538,9 +538,9 @@ def test_shuffled_points_change_the_path_and_repeat_with_the_seed(drive):
 # What the caller does with the arrays does not matter
 
 SETTINGS = {
-    "thesis": THESIS,
-    "tracked on": replace(THESIS, redetect_below=10),
-    "refined": replace(THESIS, estimator=refined),
+    "thesis": SMALL,
+    "tracked on": replace(SMALL, redetect_below=10),
+    "refined": replace(SMALL, estimator=refined),
 }
 
 

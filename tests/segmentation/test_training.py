@@ -214,30 +214,23 @@ def test_nothing_may_be_labelled():
 RECORDED = "9d39effb0706"
 
 
-@pytest.fixture(scope="module")
-def digest():
-    """The bits of a training in this process."""
-    return digest_of_training()
+@pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="recorded on x86")
+def test_the_training_gives_the_recorded_bits():
+    assert digest_of_training() == RECORDED
 
 
+@pytest.mark.torture
 @pytest.mark.skipif(
     not hasattr(os, "sched_getaffinity") or len(os.sched_getaffinity(0)) < 2,
     reason="needs two cores and a system that can restrict a process to one",
 )
-def test_one_core_and_all_give_the_same_bits(digest):
-    """And settings of another Keras in the environment do no harm."""
+def test_one_core_and_all_give_the_same_bits():
     code = (
         "import os; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))}); "
         "import small_training; print(small_training.digest())"
     )
-    another_keras = {"TF_USE_LEGACY_KERAS": 1, "KERAS_BACKEND": "jax", "SM_FRAMEWORK": "keras"}
-    one_core = succeed([sys.executable, "-c", code], Path(__file__).parent, **another_keras)
-    assert one_core.stdout.split()[-1] == digest
-
-
-@pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="recorded on x86")
-def test_the_training_gives_the_recorded_bits(digest):
-    assert digest == RECORDED
+    one_core = succeed([sys.executable, "-c", code], Path(__file__).parent)
+    assert one_core.stdout.split()[-1] == digest_of_training()
 
 
 @pytest.mark.parametrize("broken", [0, 1])
