@@ -209,6 +209,10 @@ def test_times_of_frames_are_those_that_are_listed(euroc):
     named = [f"{line.split(',')[0]},{index:06d}.png" for index, line in enumerate(lines[1:])]
     listed.write_text("\n".join([lines[0], *named, "1500000000000000000,gone.png", ""]))
     assert np.array_equal(Sequence(None, euroc).times, expected)
+    for form in ("data/{}.png", "{}.jpg", "{}", " cam0/data/{}.PNG "):  # as other tools list them
+        told = [f"{line.split(',')[0]},{form.format(line[-10:-4])}" for line in named]
+        listed.write_text("\n".join([lines[0], *told, "1500000000000000000,data/000077.png"]))
+        assert np.array_equal(Sequence(None, euroc).times, expected)
     early = named[3].replace(named[3].split(",")[0], "14037")
     for lines, said in (
         (named[:-1], "has no time of 000029.png"),
@@ -266,3 +270,47 @@ def test_masks_and_label_maps_belong_to_frames_without_distortion(
     other = Sequence(None, euroc, calibration=tmp_path / "lens.txt").subset(4)
     with pytest.raises(InputError, match="maps: made of frames with other distortion"):
         LabelMasks(tmp_path / "maps", other, 3)
+
+
+def test_label_maps_and_masks_know_whose_pictures_they_are(euroc, small_model, tmp_path, capsys):
+    """The second camera's frames have the names of the first one's."""
+    cam0, cam1 = euroc / "mav0/cam0", euroc / "mav0/cam1"
+    shutil.copytree(cam0, cam1)
+    for path in (cam1 / "data").iterdir():
+        cv2.imwrite(str(path), cv2.flip(cv2.imread(str(path), 0), 1))
+    camera = cam1 / "sensor.yaml"
+    camera.write_text(camera.read_text().replace("-0.283", "-0.3"))
+    right = Sequence(None, euroc, "cam1").subset(4)
+    write_images(tmp_path / "straight", right.label_names, right)
+
+    def command(name, *words):
+        return main([name, *map(str, words)])
+
+    def predict(output, images, *words):
+        words = *words, "--model", small_model, "--output", tmp_path / output
+        assert command("predict", "--images", images, *words) == 0
+
+    predict("left", euroc)
+    predict("right", euroc, "--camera", "cam1")
+    predict("straight labels", tmp_path / "straight")
+    predict("left, right lens", euroc, "--calibration", camera)
+    source = LabelMasks(tmp_path / "right", right, 3)
+    for index, name in enumerate(right.label_names):
+        expected = cv2.imread(str(tmp_path / "straight labels" / name), 0)
+        assert (source.label_map(index) == expected).mean() > 0.999
+    own = "--sequence", euroc, "--camera", "cam1", "--frames", 4
+    for name, words in (("masks 1", own), ("masks 0", ("--sequence", euroc))):
+        labels = tmp_path / ("right" if name == "masks 1" else "left")
+        words = *words, "--labels", labels, "--dilation", 3, "--output", tmp_path / name
+        assert command("masks", *words) == 0
+    capsys.readouterr()
+    for words, fits in (
+        (("--labels", tmp_path / "right", "--dilation", 3), True),
+        (("--labels", tmp_path / "left", "--dilation", 3), False),
+        (("--labels", tmp_path / "left, right lens", "--dilation", 3), False),
+        (("--masks", tmp_path / "masks 1"), True),
+        (("--masks", tmp_path / "masks 0"), False),
+    ):
+        assert command("odometry", *own, *words) == int(not fits)
+        last = capsys.readouterr().err.splitlines()[-1]
+        assert fits or f"{words[1]}: " in last and "another camera" in last

@@ -61,7 +61,7 @@ def predict(options: Any) -> None:
 
     if options.preprocess and options.scale != 1:
         raise InputError("--preprocess, --scale: give one of them; --preprocess scales, too")
-    images = _image_folders(options.images, options.calibration)
+    images = _image_folders(options.images, options.camera, options.calibration)
     _check_outputs(options, options.images)
     with quietly():  # this import takes seconds, so the files are checked first
         from thesis_repro.segmentation import prediction, training
@@ -300,7 +300,9 @@ def _sequence(options: Any) -> Any:
     return sequence.subset(options.frames)
 
 
-def _image_folders(root: Path, calibration: Path | None = None) -> list[tuple[Path, list, Any]]:
+def _image_folders(
+    root: Path, camera: str | None = None, calibration: Path | None = None
+) -> list[tuple[Path, list, Any]]:
     """Return (folder, its images, their camera) for each sequence that a path names.
 
     The path is a folder of images, a sequence, a KITTI folder or a folder of sequences. Without a
@@ -316,7 +318,7 @@ def _image_folders(root: Path, calibration: Path | None = None) -> list[tuple[Pa
         folders = layout.folders_with_frames(parent) or [root]
     found = []
     for folder in folders:
-        files, lens = layout.files(folder), None
+        files, lens = layout.files(folder, camera), None
         if calibration is not None:
             lens = cameras.read_camera(calibration, files.camera)
         else:

@@ -245,7 +245,7 @@ COMMANDS: dict[str, dict[str, Any]] = {
             metavar="DIR",
             help="folder of PNG or JPEG images, one sequence, or a folder of sequences, which get a subfolder each",
         ),
-        **_shared("--calibration"),
+        **_shared("--camera", "--calibration"),
         "--model": dict(
             type=path,
             metavar="FILE",

@@ -49,20 +49,21 @@ def files(folder: Path, camera: str | None) -> Files:
 def _read_times(path: Path, frames: list[Path]) -> np.ndarray:
     """Times of frames, (n,), seconds, from lines of nanoseconds and a name.
 
-    Raises InputError if a frame has no time, and unless they increase.
+    A name may have a folder before it, and another ending. Raises InputError if a frame has no
+    time, and unless they increase.
     """
     listed = {}
     for line in read_text(path).splitlines():
         time, _, name = line.partition(",")
         if not line.startswith("#"):
-            listed[name.strip()] = time
-    missing = [frame.name for frame in frames if frame.name not in listed]
+            listed[Path(name.strip()).stem] = time
+    missing = [frame.name for frame in frames if frame.stem not in listed]
     if missing:
         raise InputError(
             f"{path}: has no time of {missing[0]} ({len(missing)} of {len(frames)} frames)"
         )
     try:
-        times = 1e-9 * np.array([listed[frame.name] for frame in frames], np.float64)
+        times = 1e-9 * np.array([listed[frame.stem] for frame in frames], np.float64)
     except ValueError:
         times = np.zeros(2)
     if not (np.diff(times) > 0).all():

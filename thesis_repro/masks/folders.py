@@ -115,6 +115,7 @@ def write_masks(masks: LabelMasks, folder: str | Path) -> None:
             **label_ids.record(masks.ids),
             dilation_width=masks.dilation_width,
             frames=provenance.digest_of_files(masks.frame_paths),
+            **provenance.first_frame(masks.frame_paths),
             code=provenance.digest_of_code(*CODE),
             **provenance.versions("opencv"),
         )
@@ -236,16 +237,21 @@ def _existing_folder(folder: str | Path, sequence: Sequence, kind: str) -> Path:
 
 
 def _check_lens(place: Path, sequence: Sequence, kind: str) -> None:
-    """Say of which frames masks must be, and raise InputError if `predict` made them of others.
+    """Say of which frames masks must be, and raise InputError if a command made them of others.
 
     They live in frames without distortion, as the odometry sees them.
     """
     lens = getattr(sequence, "lens", Camera(np.eye(3), np.empty(0)))
-    made = provenance.record(place)
-    if made and "model" in made and made.get("camera", []) != lens.record():
+    made = provenance.record(place) or {}
+    how = "make them again of this sequence's folder, with the same --camera and --calibration"
+    if "first_frame" in made:
+        name, digest = made["first_frame"]
+        frame = sequence.frame_paths[0].with_name(name)
+        if frame.is_file() and provenance.digest_of_file(frame) != digest:
+            raise InputError(f"{place}: {kind}s of another camera or sequence than {frame}; {how}")
+    if "model" in made and made.get("camera", []) != lens.record():
         raise InputError(
-            f"{place}: made of frames with other distortion than the odometry sees; make them again, by "
-            "predict with --images SEQUENCE, and --calibration if the odometry gets one"
+            f"{place}: made of frames with other distortion than the odometry sees; {how}"
         )
     if lens.record():
         say_once(

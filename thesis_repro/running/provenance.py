@@ -188,6 +188,14 @@ def digest_of_files(paths: Iterable[str | Path]) -> str:
     return digest.hexdigest()[:12]
 
 
+def first_frame(paths: list[Path]) -> dict[str, list[str]]:
+    """Return name and digest of the first of some frames: whose label maps or masks are.
+
+    Two cameras, and two sequences, name their frames alike.
+    """
+    return {"first_frame": [paths[0].name, digest_of_file(paths[0])]}
+
+
 def digest_of_file(path: str | Path) -> str:
     """Return a digest of the bytes of one file."""
     with open(path, "rb") as file:

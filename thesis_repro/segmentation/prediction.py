@@ -91,6 +91,7 @@ def write_label_maps(
         inputs = {
             "model": training.weights_digest(model),
             "frames": provenance.digest_of_files(paths),
+            **provenance.first_frame(paths),
             "batch_size": batch_size,  # the arithmetic may round differently for another one
             **provenance.versions("tensorflow", "keras", "opencv"),
             "code": provenance.digest_of_code(*segmentation.CODE),
