@@ -65,7 +65,10 @@ def main() -> int:
             return 1
         names = wanted(settings)
         drop_old(settings, names)
-        status = _execute(settings, names)
+        try:
+            status = _execute(settings, names)
+        finally:
+            write_text(settings.build / "drawn", json.dumps(_drawn(settings)))
         gallery.update(settings)
     page = os.path.relpath(settings.published / "README.md")
     print(f"to read: {page}; `make book`, with the same settings, writes pages for a browser")
@@ -119,15 +122,22 @@ def drop_old(settings: Settings, names: list[str]) -> None:
     Contents decide, not dates: a clock may have been wrong. A file for each notebook in `code` has
     a digest of its code, the packages, and the data. It is written after the notebook is deleted,
     so nothing old can pass for new. An edited sentence is put into what a notebook made.
+    A lesson that was edited and run by hand has drawn into the same folder: what draws this is
+    executed again, too.
     """
     checked = provenance.digest_of_file(settings.build / "checked")
+    changed = _changed(settings)
     dropped: set[str] = set()
     for name in names:
         notebook, product = ROOT / f"notebooks/{name}.ipynb", _product(settings.build, name)
-        digest = f"{_digest(name)} {checked}"
+        code = [] if name == RENDERED else _code(notebook)
+        digest = f"{_digest(name, code)} {checked}"
         record = settings.build / "code" / name
         is_same = record.is_file() and record.read_text(encoding="utf-8") == digest
-        if not is_same or not product.is_file() or dropped & {*NEEDS[name]}:
+        edited = [each for each in changed if f'"{Path(each).stem}' in "".join(code)]
+        if edited:
+            program.log.info(f"{name}: executed again, because {edited[0]} was changed by hand")
+        if edited or not is_same or not product.is_file() or dropped & {*NEEDS[name]}:
             dropped.add(name)
             product.unlink(missing_ok=True)
             write_text(record, digest)
@@ -135,14 +145,27 @@ def drop_old(settings: Settings, names: list[str]) -> None:
             _put_sentences(notebook, product)
 
 
+def _drawn(settings: Settings) -> dict[str, str]:
+    """Return digests of the figures and tables of a run, {name of the file: digest}."""
+    paths = filter(Path.is_file, settings.figures.rglob("*.*"))
+    return {path.name: provenance.digest_of_file(path) for path in paths}
+
+
+def _changed(settings: Settings) -> list[str]:
+    """Return names of the figures and tables that are not as `main` has left them."""
+    record = settings.build / "drawn"
+    left = json.loads(record.read_text(encoding="utf-8")) if record.is_file() else {}
+    now = _drawn(settings)
+    return [name for name in left if now.get(name) != left[name]]
+
+
 def _product(build: Path, name: str) -> Path:
     """Return the file that tells make that something is made."""
     return build / name if name == RENDERED else build / f"notebooks/{name}.ipynb"
 
 
-def _digest(name: str) -> str:
+def _digest(name: str, code: list[str] | str) -> str:
     """Return a digest of a notebook's code, of the packages, and of the project's data for it."""
-    code = [] if name == RENDERED else _code(ROOT / f"notebooks/{name}.ipynb")
     read = chain(*(sorted(ROOT.glob(pattern)) for pattern in DATA.get(name, ())))
     packages = provenance.digest_of_code(*PACKAGES)
     contents = json.dumps([code, packages, provenance.digest_of_files(read)])

@@ -1,5 +1,6 @@
 """Which notebooks are executed again: contents decide, not times."""
 
+import json
 import os
 import time
 
@@ -90,6 +91,34 @@ def test_a_damaged_notebook_is_left_to_nbconvert(project, settings):
     notebook.write_text(before[:-9])
     assert again(settings) == ["07"]
     notebook.write_text(before)
+
+
+def test_what_an_edited_lesson_has_drawn_is_made_again(project, settings, caplog):
+    """It was run by hand, in the folder of the run: figure 3.1 is notebook 02's, masks 06's."""
+    caplog.set_level("INFO")
+    figures = settings.figures
+    figures.mkdir()
+    for name in ("figure_3_01.webp", "masks.csv", "figure_4_17.svg"):
+        (figures / name).write_text("by make figures")
+    assert again(settings) == []  # nothing is known of what was left
+    for name, numbers in (
+        ("figure_4_17.svg", "08 09"),
+        ("masks.csv", "06 07 08 09"),
+        ("figure_3_01.webp", "02 04 05 06 07 08 09"),
+        ("own.svg", ""),
+    ):
+        (settings.build / "drawn").write_text(json.dumps(run._drawn(settings)))
+        assert again(settings) == []
+        (figures / name).write_text("by an edited lesson")
+        caplog.clear()
+        assert again(settings) == again(settings) == numbers.split()
+        assert bool(numbers) == any(f"because {name} " in line for line in caplog.messages)
+        make(settings)
+    (settings.build / "drawn").write_text(json.dumps(run._drawn(settings)))
+    (figures / "figure_3_01.webp").rename(
+        figures / "figure_3_01.svg"
+    )  # of an edit that draws lines
+    assert again(settings)[0] == "02"
 
 
 @pytest.mark.parametrize("ahead", [-2 * HOUR, 2 * HOUR])
