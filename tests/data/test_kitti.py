@@ -175,6 +175,23 @@ def test_a_folder_of_drives_is_a_root_and_a_link_a_sequence(drive, tiny_kitti):
     assert [folder for folder, *_ in cli._image_folders(drive.parent)] == [drive]
 
 
+def test_a_calibration_may_lie_beside_a_link_to_a_drive(drive, tmp_path):
+    expected = Sequence(None, drive)
+    links = tmp_path / "links"
+    links.mkdir()
+    (links / "mine").symlink_to(drive)
+    other = CALIBRATION["cam_to_cam"].replace("P_rect_00: 50", "P_rect_00: 70")
+    (links / "calib_cam_to_cam.txt").write_text(other)
+    for place in ((links, "mine"), (None, links / "mine")):  # that of the drive's day comes first
+        assert np.array_equal(Sequence(*place).intrinsics, expected.intrinsics)
+    for name in CALIBRATION:
+        (drive.parent / f"calib_{name}.txt").replace(links / f"calib_{name}.txt")
+    for place in ((links, "mine"), (None, links / "mine"), (None, f"{links}/./mine/")):
+        sequence = Sequence(*place)
+        assert sequence.name == "mine" and np.array_equal(sequence.poses, expected.poses)
+        assert np.array_equal(sequence.intrinsics, expected.intrinsics)
+
+
 @pytest.mark.parametrize(
     ("file", "text"),
     [

@@ -2,8 +2,8 @@
 
 Read are calibration, times and poses of a folder such as 2011_09_26/2011_09_26_drive_0005_sync.
 The three calibration files lie in the folder of the day, beside the drives. A drive may also be a
-link. Poses follow KITTI's development kit (Geiger et al., Vision meets robotics: The KITTI dataset,
-2013).
+link, and they may lie beside it. Poses follow KITTI's development kit (Geiger et al., Vision meets
+robotics: The KITTI dataset, 2013).
 """
 
 from functools import partial
@@ -58,7 +58,9 @@ def files(folder: Path, camera: str | None) -> Files:
 
 def calibration(folder: Path, name: str = "cam_to_cam") -> Path:
     """Calibration file "cam_to_cam", "velo_to_cam" or "imu_to_velo" of a drive's day."""
-    return folder.resolve().parent / f"calib_{name}.txt"
+    of_day = folder.resolve().parent / f"calib_{name}.txt"
+    beside_link = folder.parent / of_day.name
+    return beside_link if beside_link.is_file() and not of_day.is_file() else of_day
 
 
 def _measurements(folder: Path) -> list[Path]:

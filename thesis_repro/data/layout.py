@@ -4,6 +4,7 @@ To add one, write a module with LAYOUT, `is_mine`, `poses` and `files`, as kitti
 enter it in LAYOUTS.
 """
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -72,7 +73,9 @@ def sequences_folder(root: str | Path) -> Path:
 def locate(root: str | Path | None, name: str | Path | int) -> Path:
     """Folder of a sequence. The arguments are those of Sequence."""
     if root is None:
-        return Path(str(name)).resolve()
+        folder = Path(os.path.abspath(str(name)))
+        # the calibration of a raw drive may lie beside a link to it
+        return folder if kitti_raw.is_mine(folder) else folder.resolve()
     name = str(Path(str(name)))  # a shell completes 07 to 07/
     folder = sequences_folder(root) / name
     if name.isdigit() and not folder.is_dir():
