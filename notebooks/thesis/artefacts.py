@@ -2,6 +2,7 @@
 
 import gc
 import json
+import os
 from base64 import b64encode
 from collections.abc import Callable
 from functools import cache
@@ -11,14 +12,13 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
-from IPython import get_ipython
 from numba.core import event as numba_events
 
 import street_world
 from keypoint_study.jobs import CONTROL_WIDTH
 from keypoint_study.report import style
 from thesis import real_frames
-from thesis.run_settings import Settings, read_settings
+from thesis.run_settings import PREFIX, Settings, read_settings
 from thesis_repro.data import cityscapes, kitti
 from thesis_repro.data.sequence import Sequence
 from thesis_repro.errors import InputError
@@ -29,15 +29,14 @@ NETWORK_IN_PACKAGE = "11a5270f8fd2"  # its digest in records of label maps, with
 
 
 class _Waiting(numba_events.Listener):
-    """Says once in a cell that it compiles: what is compiled is then on disk."""
+    """Says once in a lesson that it compiles: what is compiled is then on disk."""
 
-    said_in: int | None = None  # the number of the cell
+    has_said = False
 
     def on_start(self, event: Any) -> None:
-        cell = getattr(get_ipython(), "execution_count", 0)
-        if cell != self.said_in:
-            self.said_in = cell
+        if not self.has_said:
             print("compiling, needed once: a minute, or more on a busy machine", flush=True)
+        self.has_said = True
 
     def on_end(self, event: Any) -> None:
         pass
@@ -45,8 +44,12 @@ class _Waiting(numba_events.Listener):
 
 @cache
 def say_that_it_compiles() -> None:
-    """Let whatever Numba compiles from now on be told to who waits for it."""
-    numba_events.register("numba:compile", _Waiting())
+    """Let whatever Numba compiles from now on be told to who waits for it.
+
+    Nobody waits in a notebook that `make figures` executes, whose outputs are published.
+    """
+    if f"{PREFIX}PROGRESS" not in os.environ:
+        numba_events.register("numba:compile", _Waiting())
 
 
 def begin() -> Settings:
@@ -210,7 +213,8 @@ def label_maps() -> Path:
     model = prediction.load_shipped()
     for each in missing:
         folder = labels / each.name
-        prediction.write_label_maps(model, each.frame_paths, folder, lens=each.lens)
+        how = {"batch_size": read_settings().sizes.batch_size, "lens": each.lens}  # as notebook 5
+        prediction.write_label_maps(model, each.frame_paths, folder, **how)
     return labels
 
 

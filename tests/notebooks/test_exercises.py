@@ -293,15 +293,40 @@ def test_notebooks_6_and_7_can_be_opened_first_and_make_label_maps_to_the_end(bu
         path.unlink()
     run("06", FIRST)
     assert [path.read_bytes() for path in maps] == before and len(before) == 10
+    made = [path.stat().st_ino for path in maps]
+    run("05", PREDICTION)  # the same label maps stay for whoever has opened them
+    assert [path.stat().st_ino for path in maps] == made
 
 
-def test_a_cell_that_compiles_says_so_once(capsys, monkeypatch):
+@pytest.mark.parametrize("by_make", [False, True])
+def test_a_lesson_that_compiles_says_so_once(by_make, capsys, monkeypatch):
+    """Not in one that `make figures` executes, whose outputs are published."""
     monkeypatch.setattr(numba.core.event, "_registered", defaultdict(list))  # begun before or not
     artefacts.say_that_it_compiles.cache_clear()
+    if by_make:
+        monkeypatch.setenv(f"{PREFIX}PROGRESS", "/dev/null")
     artefacts.say_that_it_compiles()
     for number in (1, 2):
         numba.njit(lambda x, number=number: x + number)(number)
-    assert capsys.readouterr().out.count("compiling") == 1
+    assert capsys.readouterr().out.count("compiling") == int(not by_make)
+
+
+def test_a_damaged_picture_is_named(build, tmp_path, small_world, choose):
+    shutil.copytree(small_world / "cityscapes", tmp_path / "images")
+    shutil.copytree(small_world / "kitti", tmp_path / "frames")
+    choose(CITYSCAPES=tmp_path / "images", KITTI=tmp_path / "frames", PROFILE="smoke", FRAMES=5)
+    pair = cityscapes.pairs(tmp_path / "images", "train")[1]
+    frame = artefacts.sequences()[-1].frame_paths[2]
+    for path, number, cells_read in (
+        (pair.image, "01", READING),
+        (pair.label, "01", READING),
+        (frame, "05", PREDICTION.replace("23", "17")),
+    ):
+        whole = path.read_bytes()
+        path.write_bytes(whole[: len(whole) // 2])
+        with pytest.raises(AssertionError, match=f"{path.name}: damaged"):
+            run(number, cells_read)
+        path.write_bytes(whole)
 
 
 def test_notebook_9_says_whose_runs_it_reads(build):

@@ -95,6 +95,16 @@ def test_a_temporary_name_is_short_and_recognised(tmp_path):
         assert files.TEMPORARY.fullmatch(temporary.name) and len(os.fsencode(temporary.name)) < 255
 
 
+def test_no_time_is_estimated_from_the_first_step():
+    """It also compiles: from the first of 100 batches in six minutes, two hours were said."""
+    bar = files.progress(None, "label maps", 500, initial=40)
+    for step in range(4):
+        assert ("<?," in str(bar)) == (step < 2)
+        bar.start_t -= 60  # seconds that the step took
+        bar.update(16)
+    bar.close()
+
+
 def test_progress_is_written_to_the_named_file(tmp_path, monkeypatch):
     monkeypatch.setenv("THESIS_REPRO_PROGRESS", str(tmp_path / "log"))
     monkeypatch.setattr("thesis_repro.running.files.DELAY", 0)

@@ -105,6 +105,14 @@ def assert_same(folder, other):
     assert all(map(np.array_equal, *both))
 
 
+def test_threads_are_set_before_tensorflow_computes():
+    """Two lessons in one kernel: TensorFlow's own error has a traceback, and does not say why."""
+    tf.zeros(1).numpy()
+    for setting in (tf.config.threading.get_intra_op_parallelism_threads() + 1, 3):
+        with pytest.raises(InputError, match="restart it"):
+            training.fix_threads(setting)
+
+
 def test_loss_is_the_sum_of_dice_and_focal_loss():
     random = np.random.default_rng(0)
     true = augmentation.one_hot(random.integers(0, 35, (2, 8, 8)).astype(np.uint8), 35)

@@ -178,8 +178,19 @@ def _unstopped(items: Iterable) -> Iterator[Any]:
 
 
 class _Bar(tqdm):
+    first = 0  # how many items had been done when the bar first moved
+
     def __iter__(self) -> Iterator[Any]:
         return _unstopped(super().__iter__())
+
+    @property
+    def format_dict(self) -> dict[str, Any]:
+        values = super().format_dict
+        done = values["n"] - values["initial"]
+        self.first = self.first or done
+        if done <= self.first:  # the first step also compiles, so it says nothing of the others
+            values["rate"] = 0
+        return values
 
 
 def progress(

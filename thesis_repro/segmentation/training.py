@@ -160,6 +160,21 @@ class Batches:
         return batches.apply(tf.data.experimental.assert_cardinality(len(self)))
 
 
+def fix_threads(count: int) -> None:
+    """Set the number of TensorFlow's threads, which decides how sums are rounded.
+
+    Raises InputError if this process has computed with another one.
+    """
+    try:
+        tf.config.threading.set_intra_op_parallelism_threads(count)
+        tf.config.threading.set_inter_op_parallelism_threads(count)
+    except RuntimeError:
+        raise InputError(
+            f"TensorFlow: has computed with other than {count} threads in this kernel; restart it, because "
+            "this lesson sets them first"
+        ) from None
+
+
 def made_from(model: Any, batches: Batches, validation: Batches) -> dict[str, Any]:
     """Return all that the training of a compiled model on Batches depends on, as JSON values.
 
