@@ -210,11 +210,10 @@ def label_maps() -> Path:
 
     with quietly():  # what TensorFlow prints when it starts is no error
         from thesis_repro.segmentation import prediction
-    model = prediction.load_shipped()
+    model, batch_size = prediction.load_shipped(), read_settings().sizes.batch_size  # as notebook 5
     for each in missing:
         folder = labels / each.name
-        how = {"batch_size": read_settings().sizes.batch_size, "lens": each.lens}  # as notebook 5
-        prediction.write_label_maps(model, each.frame_paths, folder, **how)
+        prediction.write_label_maps(model, each.frame_paths, folder, batch_size, lens=each.lens)
     return labels
 
 
