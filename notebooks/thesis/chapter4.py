@@ -181,7 +181,7 @@ def _draw_paths(
         above.update_datalim((true + error)[:, [0, 2]])
     along = np.insert(np.linalg.norm(np.diff(true, axis=0), axis=1).cumsum(), 0, 0)
     for run in runs.itertuples():
-        line: dict[str, Any] = {"linewidth": 0.6, "alpha": 0.45, "label": "matched points shuffled"}
+        line: dict[str, Any] = {"linewidth": 0.6, "alpha": 0.45, "label": "tracks shuffled"}
         if run.repetition == 0:
             line = {"linewidth": 2, "alpha": 1, "label": "estimated path", "zorder": 3}
         drawn = true + errors[run.run]

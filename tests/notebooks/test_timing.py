@@ -3,6 +3,7 @@
 import pandas as pd
 import pytest
 
+import timings
 from keypoint_study.sources import Source
 from thesis import real_frames, timing
 from thesis.run_settings import read_settings
@@ -49,6 +50,12 @@ def test_what_a_machine_measures_changes_no_figure_in_git(monkeypatch, tmp_path,
     shown = timing.times(settings, "seconds", lambda: MEASURED)
     assert len(shown) and 0.25 not in shown["seconds"].tolist()
     assert path.read_bytes() == before
+
+
+def test_another_run_of_the_embedded_world_does_not_measure_those_in_git_anew(monkeypatch):
+    monkeypatch.setenv("THESIS_REPRO_PROFILE", "smoke")
+    with pytest.raises(InputError, match="embedded world"):
+        timings.main()
 
 
 def test_widths_are_timed_on_one_thread_and_on_all_cores(small_world, small_labels, monkeypatch):
