@@ -153,17 +153,10 @@ def _checked_track(path: Path, track: Callable) -> Callable:
         previous: np.ndarray, current: np.ndarray, points: np.ndarray, settings: Any
     ) -> tuple[np.ndarray, np.ndarray]:
         try:
-            tracked, was_found = track(previous, current, points, settings)
+            returned = track(previous, current, points, settings)
         except TypeError as error:
             raise InputError(f"{path}: track: {error}") from None
-        returned = inputs.described(tracked), inputs.described(was_found)
-        booleans = f"bool {points.shape[:1]}"
-        if returned not in [(f"float{bits} {points.shape}", booleans) for bits in (32, 64)]:
-            raise InputError(
-                f"{path}: track returned {' and '.join(returned)}; must be float32 {points.shape} and "
-                f"{booleans}, for as many points"
-            )
-        return tracked.astype(np.float32, copy=False), was_found
+        return inputs.matches(returned, points, f"{path}: track")
 
     return checked
 

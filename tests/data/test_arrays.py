@@ -1,5 +1,7 @@
 """Frames in memory stand for a sequence, with the same bits."""
 
+from datetime import datetime
+
 import numpy as np
 import pytest
 from street import Street
@@ -70,6 +72,10 @@ def test_steps_have_the_lengths_that_were_given(street, lengths, expected):
         {"times": [1]},
         {"times": [5] * 6, "scales": [1] * 6},
         {"times": [0, 1, 2, 3, 5, 4], "speed": 3},
+        {"times": np.arange(6).astype("datetime64[s]"), "speed": 3},
+        {"times": np.arange(6).astype("timedelta64[ms]"), "speed": 3},
+        {"times": [datetime(2026, 1, day) for day in range(1, 7)], "speed": 3},
+        *({"speed": speed, "times": range(6)} for speed in (0, -3, np.nan, "3", [3] * 6)),
     ],
 )
 def test_wrong_arrays_are_named(street, wrong):

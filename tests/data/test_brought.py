@@ -242,6 +242,16 @@ def test_another_file_is_no_camera(own, name, text):
     refused(own / name, text, "must hold fx fy cx cy.*OpenCV, ROS, EuRoC")
 
 
+def test_a_camera_without_a_model_of_distortion_needs_no_coefficients(own):
+    text = EUROC.replace("radial-tangential", "none")
+    for without in (
+        text.replace("[-0.3, 0.1, 0.01, -0.02]", "[]"),
+        text[: text.index("distortion_c")],
+    ):
+        (own / "camera.yaml").write_text(without)
+        assert not len(Sequence(None, own, calibration=own / "camera.yaml").lens.distortion)
+
+
 @pytest.mark.parametrize(
     "text, said",
     [

@@ -464,6 +464,31 @@ def test_own_functions_take_the_places_of_opencvs_calls(drive):
     assert metrics.rmse(result.poses[:3], few.poses[:3]) < 0.05
 
 
+@pytest.mark.parametrize(
+    "form, said",
+    [
+        (lambda tracked, found: (tracked, found.astype(np.uint8)), "uint8"),  # OpenCV's status
+        (lambda tracked, found: (tracked, found[:, None]), "bool"),
+        (lambda tracked, found: (tracked, np.flatnonzero(found)), "int64"),
+        (lambda tracked, found: (tracked[:, None], found), "float32"),
+        (lambda tracked, found: (tracked[found], found[found]), "float32"),
+        (lambda tracked, found: (tracked * np.nan, found), "finite"),
+        (lambda tracked, found: (tracked, found, found), "tuple"),
+        (lambda tracked, found: None, "NoneType"),
+    ],
+)
+def test_what_an_own_tracker_returns_is_checked(drive, form, said):
+    """NumPy takes 0 and 1 for the numbers of points, which gave a wrong path without a flag."""
+    few = Changed(drive, frames=3)
+
+    def own(previous, current, points, settings):
+        found = points[:, 0] > 100
+        return form(points + np.float32(1), found)
+
+    with pytest.raises(InputError, match=f"frame 1: the tracker returned .*{said}"):
+        odometry.run(few, calls=OPENCV._replace(track=own))
+
+
 @pytest.mark.parametrize("number", [200, 100])
 def test_the_detector_of_the_settings_holds_unless_detect_is_replaced(drive, number):
     few, settings = Changed(drive, frames=3), replace(THESIS, detector=keypoints.spread(200))

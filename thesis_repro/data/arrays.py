@@ -2,6 +2,7 @@
 
 import hashlib
 from collections.abc import Iterator
+from numbers import Real
 from typing import Any, Protocol
 
 import numpy as np
@@ -76,6 +77,8 @@ class ArraySequence:
             raise InputError("scales, poses, speed: give one of them, for the lengths of steps")
         if speed is not None and times is None:
             raise InputError("speed: needs the times of the frames, in seconds")
+        if speed is not None and not (isinstance(speed, Real) and 0 < speed < np.inf):
+            raise InputError(f"speed {speed!r}: must be a number of metres a second, above 0")
         self._frames, self.intrinsics = frames, np.array(intrinsics, float)
         self.name = self.poses_path = name
         self.times = _numbers("times", times, FRAME_TIME * np.arange(len(frames)))
@@ -168,7 +171,10 @@ def _numbers(name: str, values: Any, default: np.ndarray) -> np.ndarray:
     """Return finite numbers of the default's shape, or the default for None."""
     if values is None:
         return default
-    array = np.array(values, float)
-    if array.shape != default.shape or not np.isfinite(array).all():
-        raise InputError(f"{name}: {array.shape}; must be finite numbers, {default.shape}")
-    return array
+    array = np.array(values)
+    is_right = array.dtype.kind in "biuf" and array.shape == default.shape  # dates are no seconds
+    if not is_right or not np.isfinite(array).all():
+        raise InputError(
+            f"{name}: {array.dtype} {array.shape}; must be finite numbers, {default.shape}"
+        )
+    return array.astype(float)

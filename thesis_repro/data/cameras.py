@@ -129,6 +129,8 @@ def _of_yaml(path: str | Path, stated: dict[str, Any]) -> Camera:
     coefficients = "distortion_coefficients"
     if coefficients not in stated:
         coefficients = "distortion_coeffs"  # Kalibr
+    if stated.get("distortion_model") == "none":
+        stated = {coefficients: []} | stated
     return Camera(matrix, _numbers(stated[coefficients]), size, _body(path, stated))
 
 

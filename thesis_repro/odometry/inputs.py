@@ -138,6 +138,26 @@ def keypoints(points: Any, frame: np.ndarray, detector: str) -> np.ndarray:
     return points
 
 
+def matches(returned: Any, points: np.ndarray, tracker: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return tracked points, float32 (N, 2), and which were found, or raise InputError.
+
+    What was found must be (N,) booleans: NumPy takes OpenCV's 0 and 1 for the numbers of points.
+    points: (N, 2), those that were to be tracked. tracker: as the detector of `keypoints`.
+    """
+    booleans = f"bool {points.shape[:1]}"
+    wanted = f"must be float32 {points.shape} and {booleans}, for as many points"
+    try:
+        tracked, was_found = returned
+    except (TypeError, ValueError):
+        raise InputError(f"{tracker} returned {described(returned)}; {wanted}") from None
+    told = described(tracked), described(was_found)
+    if told not in [(f"float{bits} {points.shape}", booleans) for bits in (32, 64)]:
+        raise InputError(f"{tracker} returned {' and '.join(told)}; {wanted}")
+    if not np.isfinite(tracked[was_found]).all():
+        raise InputError(f"{tracker} returned points that are found, but no finite numbers")
+    return tracked.astype(np.float32, copy=False), was_found
+
+
 def described(value: Any) -> str:
     """Return the kind of an array, such as "int64 (500, 2)", or the type of something else."""
     if isinstance(value, np.ndarray):

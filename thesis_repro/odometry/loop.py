@@ -192,7 +192,8 @@ class Odometry:
             step.flags.append("no points")
             return
         with step.timed("track"):
-            tracked, was_found = self.calls.track(self.previous, frame, self.points, self.settings)
+            found = self.calls.track(self.previous, frame, self.points, self.settings)
+        tracked, was_found = inputs.matches(found, self.points, f"frame {step.frame}: the tracker")
         step.previous, step.current = self.points[was_found], tracked[was_found]
 
     def _estimate(self, step: Step) -> None:
