@@ -97,7 +97,7 @@ check-data: setup
 	@$(BIN)/python -m thesis_repro check-data $${THESIS_REPRO_KITTI:+--kitti "$$THESIS_REPRO_KITTI"} \
 	  $${THESIS_REPRO_CITYSCAPES:+--cityscapes "$$THESIS_REPRO_CITYSCAPES"} $${THESIS_REPRO_KITTI_SEMANTIC:+--kitti-semantic "$$THESIS_REPRO_KITTI_SEMANTIC"}
 test: setup
-	@$(BIN)/python -m pytest -q -n auto --dist loadfile --no-loadscope-reorder
+	@$(BIN)/python -m pytest -q -n auto
 torture: setup
 	@$(BIN)/python -m pytest -q -m torture
 lint: setup

@@ -155,6 +155,7 @@ def test_a_repeated_study_runs_nothing_and_another_source_only_its_runs(
     assert changed and {path.parent.name for path in changed} == {"net"}
 
 
+@pytest.mark.torture
 def test_a_killed_study_resumes_and_ends_as_an_undisturbed_one(
     done, study, small_world, small_labels, masks, tmp_path
 ):

@@ -99,6 +99,7 @@ def test_evidence_of_other_frames_goes_elsewhere(manifest, tiny_kitti, tmp_path,
 
 
 @pytest.mark.real
+@pytest.mark.torture
 def test_the_manifest_is_that_of_the_real_frames(kitti_real, tmp_path):
     raw = kitti_real.parent / "kitti_raw"
     told = command.cut_streets(str(kitti_real), str(raw), tmp_path)
