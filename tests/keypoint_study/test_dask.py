@@ -77,6 +77,7 @@ def test_an_unusable_scheduler_is_one_line(scheduler, monkeypatch):
         assert "\n" not in str(error.value)
 
 
+@pytest.mark.torture
 def test_a_cluster_gives_the_same_bits_although_a_worker_is_killed(
     small_world, small_labels, scheduler, tmp_path
 ):
