@@ -166,6 +166,9 @@ def test_a_drive_has_poses_times_and_cameras(drive):
 def test_a_folder_of_drives_is_a_root_and_a_link_a_sequence(drive, tiny_kitti):
     assert kitti.sequences(drive.parent) == [NAME]
     (tiny_kitti / "sequences/drive0001").symlink_to(drive)
+    hidden = tiny_kitti / "sequences/.AppleDouble/000000.png"
+    hidden.parent.mkdir()
+    hidden.write_bytes(b"what Finder leaves")
     assert kitti.sequences(tiny_kitti) == ["00", "drive0001"]
     expected = Sequence(None, drive)
     for root, name in ((drive.parent, NAME), (tiny_kitti, "drive0001")):

@@ -11,6 +11,7 @@ from typing import Any
 from thesis_repro.data import euroc, kitti_odometry, kitti_raw, tum
 from thesis_repro.data.frames import Files
 from thesis_repro.errors import InputError
+from thesis_repro.running.files import listed
 
 # The first one whose `is_mine` is true reads a folder; any folder of images may be the last one's.
 LAYOUTS: tuple[Any, ...] = kitti_raw, euroc, tum, kitti_odometry
@@ -50,8 +51,8 @@ def has_frames(folder: Path) -> bool:
 
 
 def folders_with_frames(parent: Path) -> list[Path]:
-    """Folders of sequences in a folder, in sorted order."""
-    return sorted(folder for folder in parent.iterdir() if folder.is_dir() and has_frames(folder))
+    """Folders of sequences in a folder, in sorted order, without hidden ones, as Finder leaves."""
+    return [folder for folder in listed(parent, "*") if folder.is_dir() and has_frames(folder)]
 
 
 def sequences_folder(root: str | Path) -> Path:
