@@ -1,4 +1,4 @@
-"""Figures 2.1, 2.4, 2.5 and A.1: diagrams, which do not depend on the data at hand."""
+"""Figures 2.1, 2.4 to 2.6 and A.1: diagrams, which do not depend on the data at hand."""
 
 from typing import Any
 
@@ -122,6 +122,19 @@ def figure_2_05(
     above = Line2D([], [], color=style.BLUE, label="weight above 0 (the wider, the larger)")
     below = Line2D([], [], color=style.RED, label="weight below 0")
     figure.legend(handles=[above, below], loc="outside lower center", ncols=2)
+    return figure
+
+
+def figure_2_06(x: np.ndarray, y: np.ndarray, loss: np.ndarray, path: np.ndarray) -> plt.Figure:
+    """Figure 2.6: steps of gradient descent, path (n, 2), on the loss over two weights."""
+    figure, axes = style.new_figure(height=3)
+    levels = axes.contourf(x, y, loss, 20, cmap="cividis")
+    axes.plot(*path.T, "o-", color="white", linewidth=1, markersize=3)
+    axes.plot(*path[0], "s", color=style.RED, markersize=9, label="start")
+    axes.plot(*path[-1], "*", color=style.RED, markersize=14, label=f"after {len(path) - 1} steps")
+    axes.set(xlabel="first weight (no unit)", ylabel="second weight (no unit)")
+    axes.legend(loc="upper left", labelcolor="white")
+    figure.colorbar(levels, label="loss (no unit)")
     return figure
 
 

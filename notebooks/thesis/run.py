@@ -42,6 +42,7 @@ PACKAGES = ("thesis_repro", "keypoint_study", "opencv_exact", "street_world", "n
 TIMES = ("figures/timings/*.csv", "figures/kitti_excerpts/timings/*.csv")
 # patterns of files of the project, beside code, that a notebook reads
 DATA = {
+    "04_training": ["figures/camvid/figure_4_01.csv"],
     "05_prediction": ["thesis_repro/segmentation/weights/*.keras"],
     "08_results": TIMES,
     "09_audit": [*TIMES, "notebooks/thesis/audit.json"],

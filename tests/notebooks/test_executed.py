@@ -52,8 +52,9 @@ def test_every_artefact_is_written_and_names_its_data(executed):
 
 
 @pytest.mark.parametrize("name", NOTEBOOKS)
-def test_a_notebook_shows_the_figures_that_it_saves(executed, name):
+def test_a_notebook_is_executed_and_shows_the_figures_that_it_saves(executed, name):
     run = code_cells(executed, name)
+    assert all(cell.execution_count for cell in run)  # the appendix's calls are executed
     shown = sum("image/png" in output.get("data", ()) for cell in run for output in cell.outputs)
     assert shown >= sum(len(SAVED.findall(cell.source)) for cell in run)
 
@@ -61,7 +62,7 @@ def test_a_notebook_shows_the_figures_that_it_saves(executed, name):
 def test_cells_and_package_agree_to_the_bit(executed):
     texts = {name[:2]: printed(executed, name) for name in NOTEBOOKS}
     agreeing = {number: text.count("to the bit: True") for number, text in texts.items()}
-    assert sum(agreeing.values()) >= 10 and min(agreeing[each] for each in ("05", "06", "07")) >= 1
+    assert min(agreeing[each] for each in ("01", "02", "04", "05", "06", "07")) >= 1
     assert not [text for text in texts.values() if "to the bit: False" in text or "EDITED" in text]
 
 

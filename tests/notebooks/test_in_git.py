@@ -13,7 +13,6 @@ from nbconvert import ScriptExporter
 from thesis import run
 from thesis.run_settings import ROOT
 
-LOOP = "def path_by_hand("  # the one cell that may be longer
 # functions, classes and notebook commands in the listings of each section of the appendix
 CALLS = {
     "A.1": 2,
