@@ -58,6 +58,31 @@ def test_another_run_of_the_embedded_world_does_not_measure_those_in_git_anew(mo
         timings.main()
 
 
+def test_a_run_times_its_widths_and_the_tested_one_once(settings, small_world, monkeypatch):
+    asked = {}
+
+    def of_widths(sequences, source, widths):
+        asked["widths"] = [len(each) for each in sequences], list(widths)
+        return MEASURED
+
+    def of_stages(sequence, model, width):
+        asked["stages"] = len(sequence), model, width
+        return MEASURED
+
+    monkeypatch.setattr(timing, "seconds_of_widths", of_widths)
+    monkeypatch.setattr(timing, "time_stages", of_stages)
+    monkeypatch.setattr(timing.artefacts, "used_model", lambda: "the network")
+    given = settings, [Sequence(small_world / "kitti", "00").subset(5)], None, 7
+    timing.of_run(*given)
+    measured = {"widths": ([3], [5, 7, 10]), "stages": (5, "the network", 7)}
+    assert asked == measured
+    asked.clear()
+    timing.of_run(*given)
+    assert asked == {}
+    timing.of_run(*given, anew=True)
+    assert asked == measured
+
+
 def test_widths_are_timed_on_one_thread_and_on_all_cores(small_world, small_labels, monkeypatch):
     monkeypatch.setattr(timing, "cores", lambda: 2)
     monkeypatch.setattr(timing, "TURNS", 1)
