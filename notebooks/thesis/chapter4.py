@@ -262,21 +262,19 @@ def _draw_lines(figure: Any, lines: pd.DataFrame, crosses: pd.Series) -> None:
     lines: one column a sequence; the half with lower errors has the lower one of two panels.
     crosses: the means with a failed run in them, by sequence and width.
     """
-    looks = dict(zip(lines, zip(LINES, style.LINE_COLORS * 2)))
     names = list(lines.median().sort_values(ascending=False).index)
     count = 2 if len(names) > 4 else 1
     panels = figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0]
-    for panel, part in zip(panels, np.array_split(names, count), strict=True):
-        half = sorted(part)
-        marks, colors = zip(*(looks[name] for name in half))
-        lines[half].plot(
-            ax=panel, style=list(marks), color=colors, markersize=3.5, xticks=lines.index
-        )
+    for panel, half in zip(panels, np.array_split(names, count), strict=True):
+        for name in sorted(half):
+            place = lines.columns.get_loc(name)
+            look = {"marker": "os^D"[place % 4], "markersize": 3.5, **style.line_style(place)}
+            panel.plot(lines[name], label=name, **look)
+            if name in crosses:
+                panel.plot(crosses[name], **FAILED | {"label": None})
         style.ratio_axis(panel.yaxis, lines[half].to_numpy())
         panel.legend(loc="upper left", bbox_to_anchor=(1, 1))
-        for (name, width), error in crosses.items():
-            if name in half:
-                panel.plot(width, error, **FAILED)
+        panel.set_xticks(lines.index)
     panels[-1].set_xlabel("dilation width (pixels)")
 
 
