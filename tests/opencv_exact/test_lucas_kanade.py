@@ -125,6 +125,8 @@ def test_300000_points_of_real_and_made_up_frames_give_opencvs_bits(kitti_real):
 
 ODD_POINTS = {
     "one": [[0, 0]],
+    "fifteen": [[50.5 + k, 40.25] for k in range(15)],  # one lane is free
+    "sixteen": [[50.5 + k, 40.25] for k in range(16)],
     "equal": [[50.5, 50.5]] * 17,
     "far outside": [[1e9, 5], [-1e9, 5], [5, 1e30], [3e38, -3e38]],
     "not numbers": [[np.nan, 5], [5, np.nan], [np.inf, 5], [5, -np.inf], [100, 100]],
@@ -168,6 +170,7 @@ def test_inputs_of_other_kinds_are_left_to_opencv():
         (previous, current),
         (np.dstack([previous] * 3), np.dstack([current] * 3)),
         (previous[::2, ::2], current[::2, ::2]),
+        (previous, np.asfortranarray(current)),
     ):
         expected = cv2.calcOpticalFlowPyrLK(*frames, points, None)
         for result, other in zip(track(*frames, points), expected, strict=True):
@@ -243,7 +246,6 @@ def test_no_pyramid_is_kept_of_memory_that_others_can_change():
 
 @pytest.mark.skipif(bool(reason_for_opencv()), reason=reason_for_opencv() or "lanes")
 def test_lanes_are_faster_than_opencv():
-    """Where LLVM vectorises them. Scalar, they take 2 to 4 times as long as OpenCV."""
     random = np.random.default_rng(8)
     previous, current = street(random, 2, (376, 1241))
     for frame in (previous, current):
@@ -259,4 +261,4 @@ def test_lanes_are_faster_than_opencv():
                 least[k] = min(least[k], time.thread_time() - started)
     finally:
         cv2.setNumThreads(threads)
-    assert least[0] < 0.85 * least[1]
+    assert least[0] < 0.6 * least[1]
