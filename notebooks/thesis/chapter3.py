@@ -13,7 +13,6 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 
 import thesis_repro as tr
-from keypoint_study.jobs import CONTROL_WIDTH
 from keypoint_study.report import style
 from keypoint_study.report.style import BLUE, ORANGE, RED, SKY
 from thesis import views
@@ -204,10 +203,16 @@ def figure_masks(
 
 
 def row_of_run(result: Any, of_frames: Any, drive: Sequence) -> dict[str, float]:
-    """Return a row of a table: the masks of a run over a drive, its keypoints and errors."""
-    covered = [masks.coverage(of_frames[number]) for number in range(0, len(drive), 5)]
+    """Return a row of a table: the masks of a run over a drive, its keypoints and errors.
+
+    of_frames: a mask a frame, or None for all keypoints.
+    """
+    covered = 1.0
+    if of_frames is not None:
+        some = range(0, len(drive), 5)
+        covered = float(np.mean([masks.coverage(of_frames[number]) for number in some]))
     return {
-        "coverage (%)": 100 * np.mean(covered),
+        "coverage (%)": 100 * covered,
         "keypoints": result.frames["detected"].mean(),
         "aligned ATE (m)": metrics.ate(result.poses, drive.poses, "se3"),
         "rotation error (°/frame)": metrics.step_errors(result.poses, drive.poses)["rotation"],
@@ -240,22 +245,6 @@ def counts(drive: Sequence, labels: Path, numbers: Rows[int], *how: Any) -> dict
             count["of true label maps (%)"] = 100 * masks.boundaries_found(perfect, true)
         rows.append(count)
     return dict(pd.DataFrame(rows).mean())
-
-
-def parts(drive: Sequence, labels: Path) -> dict[str, np.ndarray]:
-    """Return parts of the thesis's masks of a drive: {what they are: (n, height, width) uint8}.
-
-    With true label maps, a mask is divided into what lies near a true boundary and what does not.
-    """
-    predicted = np.array(tr.LabelMasks(labels, drive, CONTROL_WIDTH))
-    kinds = {"all keypoints": np.full_like(predicted, 255), "predicted label maps": predicted}
-    exact = drive.folder / kitti.TRUE_LABELS
-    if exact.is_dir():
-        true = np.array(tr.LabelMasks(exact, drive, CONTROL_WIDTH))
-        kinds["of these, near true boundaries"] = np.where(true > 0, predicted, 0)
-        kinds["of these, invented"] = np.where(true > 0, 0, predicted)
-        kinds |= {"true label maps": true, "true and predicted ones": np.maximum(predicted, true)}
-    return kinds
 
 
 def overview(

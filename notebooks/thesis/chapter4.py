@@ -31,6 +31,7 @@ from keypoint_study.report.style import (
 )
 from thesis import views
 from thesis.views import View
+from thesis_repro.odometry.loop import detect
 
 DRAWN_METHODS = {
     "baseline": ("all keypoints", BASELINE),
@@ -70,6 +71,30 @@ def figure_4_04(
     brighter = np.clip(230 * (frame / bright) ** 0.6, 0, 255).astype(np.uint8)
     style.show_image(axes, views.with_edges(brighter, edge_image), title)
     axes.scatter(*keypoints.T, s=9, color=KEYPOINT["color"], edgecolors="black", linewidths=0.4)
+    return figure
+
+
+def figure_4_05(
+    frame: np.ndarray, label_map: np.ndarray, mask: np.ndarray, title: str
+) -> plt.Figure:
+    """Figure 4.5: a frame, its label map and mask, and the keypoints on the mask and off it.
+
+    The detector finds more keypoints on the mask than there lie of all keypoints, because it looks
+    for as many.
+    """
+    every, kept = detect(frame), detect(frame, mask=mask)
+    columns, rows = every.astype(int).T
+    dropped = every[mask[rows, columns] == 0]
+    pictures = {
+        f"(a) {title}": frame,
+        f"(b) {len(every)} keypoints, wherever they are": (frame, every),
+        "(c) label map: a class for each pixel": style.label_colors(label_map, frame),
+        "(d) mask: white where classes meet": mask,
+        f"(e) {len(kept)} keypoints on the mask: enough?": (frame, kept),
+        f"(f) {len(dropped)} of (b) off the mask: needed?": (frame, dropped),
+    }
+    figure = views.pictures(frame, pictures, columns=2, label_maps=[label_map])
+    figure.axes[5].collections[0].set_color(style.ORANGE)
     return figure
 
 

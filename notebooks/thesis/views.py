@@ -14,8 +14,6 @@ from matplotlib.ticker import MaxNLocator
 from keypoint_study.report import style
 from keypoint_study.report.style import GREEN, RED
 from thesis_repro import masks
-from thesis_repro.data import cityscapes
-from thesis_repro.masks import dilate
 from thesis_repro.odometry import THESIS
 from thesis_repro.odometry.loop import detect, track
 
@@ -74,17 +72,6 @@ def small_panels(
     for panel in panels[-columns:]:
         panel.set_xlabel(xlabel, fontsize=8)
     return figure, panels
-
-
-def gradients(enlarged: np.ndarray, strength: np.ndarray, edge_image: np.ndarray) -> plt.Figure:
-    """Draw an enlarged label map, the strength of its gradient, and its edges; (h, w) each."""
-    figure, axes = style.frame_panels(enlarged, rows=3)
-    style.show_image(axes[0], cityscapes.colorize(enlarged), "ids, enlarged bilinearly")
-    style.show_image(axes[1], np.minimum(strength, 60), "|Gx| + |Gy|, up to 60")
-    # thin lines would drop out where the picture is reduced
-    wider = dilate(edge_image, 5)
-    style.show_image(axes[2], wider, "edges: local maxima above the thresholds, drawn wider")
-    return figure
 
 
 def tracks(

@@ -92,6 +92,17 @@ def test_matched_points_of_a_shifted_frame():
     assert np.median(in_second - in_first, axis=0) == pytest.approx((5, 0), abs=0.1)
 
 
+def test_the_procedure_shows_keypoints_on_the_mask_and_those_of_all_off_it():
+    mask = np.zeros_like(FRAME)
+    mask[:, :200] = 255
+    panels = chapter4.figure_4_05(FRAME, MASK // 255, mask, "title").axes
+    every, kept, dropped = (panels[n].collections[0].get_offsets() for n in (1, 4, 5))
+    assert kept[:, 0].max() < 200 <= dropped[:, 0].min()
+    assert len(dropped) == (every[:, 0] >= 200).sum() > 100
+    numbers = [str(len(points)) for points in (every, kept, dropped)]
+    assert all(number in panels[n].get_title() for number, n in zip(numbers, (1, 4, 5)))
+
+
 def test_keypoints_jump_with_a_moving_boundary_alone():
     frame = textured(size=(120, 240))
     car = np.where(MASK[:, :240] > 0, ID["car"], ID["road"]).astype(np.uint8)
