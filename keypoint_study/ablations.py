@@ -16,6 +16,7 @@ from thesis_repro.odometry import THESIS, metrics
 from thesis_repro.odometry.loop import detect, normalise, track
 
 VEGETATION = (ID["vegetation"], ID["terrain"])
+HELD = 5  # frames that have one mask, where boundaries hold still
 
 
 def without_vegetation(label_masks: LabelMasks, index: int) -> np.ndarray:
@@ -108,3 +109,13 @@ def half_in_turns(sequence: Sequence, into: bool, index: int) -> np.ndarray:
         turns_right = motion[0, 2] > 0  # the optical axis moves to the right
         mask[np.s_[:, :middle] if turns_right == into else np.s_[:, middle:]] = 0
     return mask
+
+
+def earlier_mask(label_masks: LabelMasks, steady: bool, index: int) -> np.ndarray:
+    """Return the mask of one of the HELD last frames, to see what changing boundaries do.
+
+    steady: HELD frames in turn have the mask of the first of them. Otherwise each draws its own of
+    the last HELD ones. Masks are then off by as many frames, but jump in each.
+    """
+    lag = index % HELD if steady else int(np.random.default_rng((0, index)).integers(HELD))
+    return label_masks[max(index - lag, 0)]

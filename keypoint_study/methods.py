@@ -216,6 +216,8 @@ METHODS = {  # in the order in which they are shown
         "half turned from", ABLATION, of_sequence(ablations.half_in_turns, False)
     ),
     "orb": Method("ORB", ABLATION, found_by(orb, all_keypoints)),
+    "held": Method("masks held", ABLATION, altered(ablations.earlier_mask, True)),
+    "jumping": Method("masks that jump", ABLATION, altered(ablations.earlier_mask, False)),
 }
 # the methods with masks beside "masked", which the tested width of a study is for
 MASK_CONTROLS = [

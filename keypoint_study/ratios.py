@@ -58,15 +58,20 @@ def typical_interval(values: ArrayLike, level: float = LEVEL) -> tuple[float, fl
         return np.nan, np.nan, np.nan
     first, second = np.triu_indices(len(numbers))
     pair_means = np.sort((numbers[first] + numbers[second]) / 2)
-    # the chance of each rank sum: every rank belongs to a positive difference in half of the cases
-    chances = np.ones(1)
-    for rank in range(1, len(numbers) + 1):
-        chances = np.convolve(chances, [0.5, *[0] * (rank - 1), 0.5])
-    rejected = int((chances.cumsum() <= (100 - level) / 200).sum())  # rank sums at either end
+    rejected = rejected_sums(len(numbers), level)
     estimate = float(np.median(pair_means))
     if not rejected:
         return estimate, np.nan, np.nan
     return estimate, float(pair_means[rejected - 1]), float(pair_means[-rejected])
+
+
+def rejected_sums(n: int, level: float = LEVEL) -> int:
+    """Return how many sums of ranks, from 0 on, the exact signed-rank test of n values rejects."""
+    # the chance of each rank sum: every rank belongs to a positive difference in half of the cases
+    chances = np.ones(1)
+    for rank in range(1, n + 1):
+        chances = np.convolve(chances, [0.5, *[0] * (rank - 1), 0.5])
+    return int((chances.cumsum() <= (100 - level) / 200).sum())  # at either end
 
 
 def typical_ratio(ratios: ArrayLike) -> dict[str, Any]:

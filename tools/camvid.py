@@ -13,10 +13,11 @@ import os
 import time
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pandas as pd
 
-from keypoint_study import comparisons
+from keypoint_study import comparisons, ratios
 from keypoint_study.jobs import CONTROL_WIDTH
 from keypoint_study.plan import Study
 from keypoint_study.report import comparison, style
@@ -24,6 +25,7 @@ from keypoint_study.sources import Source
 from thesis import REPORTED, map_quality
 from thesis.run_settings import PROFILES, ROOT
 from thesis_repro.data import cityscapes, kitti
+from thesis_repro.data.cityscapes import ID
 from thesis_repro.data.sequence import Sequence
 from thesis_repro.running import files, program, provenance
 from thesis_repro.segmentation import augmentation
@@ -219,6 +221,58 @@ def table_of_training(histories):
     return table.loc[list(next(iter(facts.values())))].rename_axis("training").reset_index()
 
 
+def table_of_areas(network, pairs, domain):
+    """Return how right a network is in parts of images, and how many of its edges are invented.
+
+    One row a measure: those of `map_quality.right_shares`, and the share (%) of Canny's edges of a
+    predicted map that lie beside the true boundaries, by its thresholds. Means over the images.
+    """
+    from thesis_repro.segmentation import prediction
+
+    images, _ = cityscapes.load(pairs, SIZES.image_size)
+    rows = []
+    for pair, predicted in zip(pairs, prediction.predict(network, images), strict=True):
+        image = cv2.imread(str(pair.image), cv2.IMREAD_GRAYSCALE)
+        exact = cityscapes.read_label_map(pair.label)
+        row = map_quality.right_shares(predicted, exact, image)
+        for low, high in map_quality.THRESHOLDS[:2]:
+            row[f"invented {low}/{high}"] = map_quality.invented(predicted, exact, (low, high))
+        rows.append(row)
+    lines = []
+    for measure, values in pd.DataFrame(rows).items():
+        ends = ratios.mean_interval(values)
+        lines.append([domain, measure, values.mean(), *ends, values.count()])
+    return pd.DataFrame(lines, columns=["images", "measure", "mean (%)", "low", "high", "n"])
+
+
+def table_of_pixels(domains):
+    """Return the share (%) of pixels without a class, and those of persons over the road's."""
+    lines = []
+    for domain, pairs in domains.items():
+        counts = np.zeros(256, int)
+        for pair in pairs:
+            counts += np.bincount(cityscapes.read_label_map(pair.label).ravel(), minlength=256)
+        nothing = 100 * counts[0] / counts.sum()
+        lines.append([domain, len(pairs), nothing, counts[ID["person"]] / counts[ID["road"]]])
+    names = ["label maps", "number", "pixels without a class (%)", "persons over road"]
+    return pd.DataFrame(lines, columns=names)
+
+
+def write_areas(options, pairs):
+    """Write what needs no training: the package's network by area, and counts of pixels."""
+    from thesis_repro.segmentation import prediction
+
+    held_out, domains = pairs["val"], {f"{options.camvid.name}'s training images": pairs["train"]}
+    if options.kitti_semantic:
+        domains["KITTI's street scenes"] = cityscapes.pairs(options.kitti_semantic, "train")
+    areas = table_of_areas(
+        prediction.load_shipped(), held_out, f"{options.camvid.name}, validation"
+    )
+    style.save_table(areas.round(2), options.figures, "areas", "the network in the package")
+    pixels = table_of_pixels(domains).round(4)
+    style.save_table(pixels, options.figures, "pixels", f"{options.camvid.name}")
+
+
 def table_of_streets(model, root, folder):
     """Return the errors with masks from a network's label maps, over those with all keypoints."""
     from thesis_repro.segmentation import prediction
@@ -279,9 +333,13 @@ def main(arguments=None):
     parser.add_argument("--backend", default="tensorflow", help="of Keras: jax, torch")
     parser.add_argument("--kitti", type=Path, help="also write what its masks do to the odometry")
     parser.add_argument("--kitti-semantic", type=Path, help="also score KITTI's street scenes")
+    parser.add_argument("--areas", action="store_true", help="only measure the package's network")
     options = parser.parse_args(arguments)
     os.environ["KERAS_BACKEND"] = options.backend  # the package sets TensorFlow; Keras reads it
     pairs = {split: cityscapes.pairs(options.camvid, split) for split in ("train", "val")}
+    if options.areas:
+        write_areas(options, pairs)
+        return
     made_from = provenance.digest_of_files(
         path for split in pairs.values() for pair in split for path in pair[1:]
     )

@@ -17,12 +17,13 @@ import pandas as pd
 from keypoint_study import comparisons, jobs, ratios, runner
 from keypoint_study.report import style, texts
 from keypoint_study.sources import Source
-from thesis import few_keypoints, real_frames, timing
+from thesis import claims, equal_number, few_keypoints, real_frames, timing, views
 from thesis.run_settings import read_settings
 from thesis_repro.data import kitti
 from thesis_repro.data.sequence import Sequence
 from thesis_repro.errors import InputError
-from thesis_repro.odometry import metrics
+from thesis_repro.odometry import THESIS, metrics
+from thesis_repro.odometry.loop import detect
 from thesis_repro.running import program, provenance
 from thesis_repro.running.files import needed, write_text
 
@@ -36,6 +37,7 @@ KEPT = (
     "audit",
     "budget",
 )
+PAIRS = 6  # of frames of each sequence, in which keypoints are found again
 RUNS = ("runs", "shuffled_runs", "ablations")  # tables of runs in the build folder
 # What the sequences show at their start: 00 to 10 are KITTI odometry's, the others raw drives.
 STREETS = {
@@ -96,6 +98,8 @@ def write(settings, folder):
     provenance.sweep(folder)
     for name in KEPT:
         _copy(settings.figures, name, folder)
+    if not settings.cityscapes_is_embedded:
+        _copy(settings.figures, "figure_4_01", folder)
     (folder / "audit.md").unlink()  # the page beside the gallery has its numbers, too
     style.save_figure(few_keypoints.figure_of_few(few), folder, "few_keypoints", note)
     for_readers = {
@@ -111,11 +115,17 @@ def write(settings, folder):
         "few_keypoints_runs": few_runs,
         "every_second_runs": second_runs,
         "refined_widths_runs": of_widths,
+        "found_again": found_again(sequences, labels),
+        "ends": ends(settings, sequences),
     }
     for name, rows in of_runs.items():
         # six digits are enough: shuffling the matched points changes more
         text = rows.to_csv(index=False, lineterminator="\n", float_format="%.6g")
         write_text(folder / f"{name}.csv", text)
+    seconds = timing.folder(settings) / "seconds.csv"
+    write_text(folder / "timings" / "seconds.csv", seconds.read_text(encoding="utf-8"))
+    equal_number.write(of_runs.__getitem__, folder, note)
+    claims.write(folder, note)
     findings = needed(settings.figures / "findings.md", "08_results").read_text(encoding="utf-8")
     write_text(
         folder / "README.md",
@@ -178,6 +188,53 @@ def runs_of_widths(settings, sequences, labels):
     return runner.run_all(
         jobs.runs_of(planned, sequences, [Source(labels)]), folder, processes=settings.jobs
     ).table
+
+
+def found_again(sequences, labels):
+    """Count the keypoints that the next frame does not find, in PAIRS of frames of each sequence.
+
+    One row a pair and choice: all keypoints, those on the mask, and as many of the strongest.
+    """
+    rows = []
+    for sequence in sequences:
+        masks = Source(labels).masks(sequence, jobs.CONTROL_WIDTH)
+        for index in np.linspace(0, len(sequence) - 2, PAIRS).round().astype(int):
+            frames = [sequence.frame(number) for number in (index, index + 1)]
+            on_mask = [masks[number] for number in (index, index + 1)]
+            chosen = {"all": [None, None], "mask": on_mask}
+            chosen["strongest"] = [
+                _strongest(frame, len(detect(frame, THESIS, mask)))
+                for frame, mask in zip(frames, on_mask, strict=True)
+            ]
+            for choice, of_both in chosen.items():
+                again, _, lost, _ = views.found_again(*frames, *of_both)
+                detected = len(again) + len(lost)
+                rows.append([sequence.name, index, choice, detected, len(lost)])
+    return pd.DataFrame(rows, columns=["sequence", "frame", "choice", "detected", "lost"])
+
+
+def _strongest(frame, number):
+    """Return a mask that keeps the strongest keypoints of a frame, one pixel each."""
+    mask = np.zeros_like(frame)
+    columns, rows = detect(frame, THESIS)[:number].astype(int).T
+    mask[rows, columns] = 255
+    return mask
+
+
+def ends(settings, sequences):
+    """Return how far both ends of a true path are apart, and by how much paths miss its end.
+
+    Metres; one row a run with all keypoints and the thesis's estimator.
+    """
+    runs = comparisons.of_method(_read(settings, "runs"), "baseline", "thesis")
+    true = {sequence.name: sequence.poses for sequence in sequences}
+    rows = []
+    for (name, run), poses in runner.run_poses(runs, settings.build / "odometry").items():
+        first, last = true[name][0, :3, 3], true[name][-1, :3, 3]
+        metres = metrics.travelled(true[name])[-1]
+        apart, missed = np.linalg.norm(first - last), np.linalg.norm(poses[-1, :3, 3] - last)
+        rows.append([name, run, metres, apart, missed])
+    return pd.DataFrame(rows, columns=["sequence", "run", "metres", "between ends", "missed"])
 
 
 def table_of_widths(runs):

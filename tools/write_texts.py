@@ -13,7 +13,7 @@ import pandas as pd
 
 from keypoint_study import comparisons, ratios, verdicts
 from keypoint_study.report import texts
-from thesis import claims, equal_number, few_keypoints, gallery
+from thesis import audit, claim_rule, claims, equal_number, few_keypoints, gallery, tables
 from thesis.run_settings import ROOT, read_settings
 from thesis_repro.command import cli
 from thesis_repro.command.options import build_parser
@@ -73,52 +73,10 @@ def error(
     return row
 
 
-def verdict(method: str = "masked", over: str = "baseline", estimator: str = "refined") -> str:
-    """Return the verdict on both errors that decide."""
-    rows = [error(metric, method, over, estimator) for metric in comparisons.JUDGING_METRICS]
-    return comparisons.verdict_of(pd.DataFrame(rows))
-
-
-def of_controls() -> list[str]:
-    """Return the verdicts on masks against each control without segmentation."""
-    return [verdict(over=name) for name in comparisons.SEGMENTATION_FREE_CONTROLS]
-
-
 def by_chance(estimator: str = "thesis") -> pd.Series:
     """Return the highest RMSE over the lowest of shuffled runs with all keypoints, by street."""
     rows = ratios.range_of_shuffles(read_table(f"{REAL}runs"))
     return rows.loc[rows["estimator"] == estimator, "factor"]
-
-
-def few(
-    choice: str,
-    number: int,
-    metric: str,
-    estimator: str = "refined",
-    over: str = "all",
-    table: str = "few_keypoints",
-) -> dict[str, Any]:
-    """Return the numbers of `ratios.typical_ratio` for so many keypoints, and more.
-
-    end: the upper end of the interval of NARROW_LEVEL. failing: on how many streets half of the
-    runs fail. failures: the verdict on more or fewer failures. word: that on few keypoints, of both
-    errors and estimators. table: or every_second.
-    """
-    runs = read_table(f"{REAL}{table}_runs")
-    sides = [
-        runs.query("choice == @choice and number == @number"),
-        runs.query("choice == @over and number in (0, @number)"),
-    ]
-    chosen, reference = (side[side["estimator"] == estimator] for side in sides)
-    of_streets = ratios.ratios_of(chosen, reference, metric)
-    failed, of_reference = (rows.set_index("sequence")["failed"] for rows in (chosen, reference))
-    return ratios.typical_ratio(of_streets) | {
-        "keypoints": chosen["keypoints"].mean(),
-        "end": ratios.narrow_interval(of_streets)[1],
-        "failing": streets(equal_number.failing(chosen)),
-        "failures": comparisons.failures(failed, of_reference)["failures_verdict"],
-        "word": few_keypoints.verdict_on(*sides),
-    }
 
 
 def streets(of: str) -> str:
@@ -133,27 +91,10 @@ def of_masks() -> pd.DataFrame:
     return equal_number.over(*equal_number.of_pair(*tables, pair, "refined"))
 
 
-def metres() -> list[float]:
-    """Return how many metres masks add to the aligned ATE (refined), by street, least first."""
-    pair = equal_number.MASKS, equal_number.EVERY
-    tables = read_table(f"{REAL}few_keypoints_runs"), read_table(f"{REAL}runs")
-    means = [
-        rows.groupby("sequence")["se3"].mean()
-        for rows in equal_number.of_pair(*tables, pair, "refined")
-    ]
-    return sorted((means[0] - means[1]).abs())
-
-
 def of_few(choice: str, number: int, column: str, name: str = f"{REAL}few_keypoints") -> Any:
     """Return what stands in a column of the table of few keypoints. number: 0 for no limit."""
     row = {"how chosen": few_keypoints.LABELS[choice]}
     return cell(name, column, row | ({"keypoints": number} if number else {}))
-
-
-def of_rendered(metric: str) -> str:
-    """Return an error of 200 spread keypoints over that of all in the embedded world."""
-    text = of_few("spread", 200, f"{metric}, refined estimator", "few_keypoints")
-    return re.sub(r"\).*", ")", text)
 
 
 def data_note() -> str:
@@ -164,9 +105,41 @@ def data_note() -> str:
 
 
 @cache
+def at_hand() -> claims.Tables:
+    """Return the tables that the claims are tested on."""
+    return claims.Tables(read_table, claims.EVIDENCE)
+
+
+@cache
 def all_claims() -> list[claims.Claim]:
     """Return what became of each claim of the thesis."""
-    return claims.claims_of(read_table)
+    return claims.claims_of(at_hand())
+
+
+def words() -> str:
+    """Return how many claims have each word: "3 reproduced, 2 not reproduced"."""
+    found = [each.word for each in all_claims()]
+    return ", ".join(f"{found.count(word)} {word}" for word in claim_rule.WORDS)
+
+
+def by_procedure(metric: str) -> dict[str, float]:
+    """Return the mean changes (%) that the thesis's procedure finds, and if masks do nothing."""
+    found, studies = claims.procedure(at_hand(), metric)
+    means, by_chance = found.mean(), studies.mean(axis=1)
+    low, high = tables.middle(by_chance)
+    ends = {"least": means.max(), "most": means.min(), "low": low, "high": high}
+    return ends | {"by_chance": by_chance.mean()}
+
+
+def seen(metric: str, side: int) -> float:
+    """Return the change of an error with masks that as many sequences would have shown."""
+    return claim_rule.seen(at_hand().over("runs", "masked", "baseline", metric), side)
+
+
+def needed(metric: str) -> str:
+    """Return how many sequences would show a change of an error by the thesis's mean."""
+    ratio = 1 + audit.CHANGES[metric.upper()].mean() / 100
+    return claim_rule.needed(at_hand().over("runs", "masked", "baseline", metric), ratio)
 
 
 def claim(name: str) -> claims.Claim:
@@ -245,19 +218,18 @@ FUNCTIONS = (
     commands,
     rows_of_options,
     error,
-    verdict,
-    of_controls,
     by_chance,
-    few,
+    by_procedure,
+    seen,
+    needed,
     of_few,
-    of_rendered,
     claim,
     all_claims,
+    words,
     book,
     equal,
     of_masks,
     equal_number.share_of_days,
-    metres,
     whole,
     two,
     with_interval,

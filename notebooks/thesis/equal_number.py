@@ -33,6 +33,7 @@ CHOICES = {
     "200 random ones on the mask": ("random-on", 200),
     "100 strongest on the mask": ("mask", 100),
     "100 random ones": ("random", 100),
+    "800 random ones": ("random", 800),  # about as many as masks leave
 }
 DRAWN = 6
 CALLED = {"200 spread": "200 spread over the frame", "the mask": MASKS}  # in the figure
@@ -46,6 +47,7 @@ PAIRS = (
     ("200 spread", "200 random ones"),
     ("200 spread", "200 strongest"),
     ("the mask, filled", "the mask"),
+    ("the mask", "800 random ones"),
     (MASKS, EVERY),
 )
 REACH = 8  # of the figure's axis, from 1 / REACH to REACH

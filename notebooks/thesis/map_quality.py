@@ -193,3 +193,13 @@ def found_boundaries(
     edges = masks.edges(label_map, size, MaskSettings(canny=canny))
     found = masks.dilate(edges, 2 * NEAR + 1) > 0
     return 100 * found[boundary].mean() if boundary.any() else np.nan
+
+
+def invented(predicted: np.ndarray, exact: np.ndarray, canny: tuple[int, int]) -> float:
+    """Return the share (%) of a predicted map's edges that lie beside the true boundaries.
+
+    Beside: by more than NEAR pixels. canny: thresholds. NaN without edges.
+    """
+    edges = masks.edges(predicted, exact.shape, MaskSettings(canny=canny)) > 0
+    boundary = masks.dilate(masks.edges(exact, exact.shape, EXACT), 2 * NEAR + 1) > 0
+    return 100 * (1 - boundary[edges].mean()) if edges.any() else np.nan
