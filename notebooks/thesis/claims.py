@@ -240,65 +240,57 @@ def _listed(numbers: pd.Series, digits: str = ".1f") -> str:
 # Both errors that decide
 
 
+MARGINS = {name: error.margin for name, error in ERRORS.items() if error.decides}
+MARGINS |= {"in_turns": ERRORS["rotation"].margin, "rmse": MARGIN}
+CALLED = {"se3": "aligned ATE", "rotation": "rotation", "in_turns": "rotation in turns"}
+
+
+def judged(side: int, errors: list[claim_rule.Error], here: str) -> Found:
+    """Return the word on ratios that are said to be lower (side -1), higher (1) or no larger (0).
+
+    here: what stands in the cell. Where nothing is decided, it says what would have been.
+    """
+    word = claim_rule.on_side(side, *errors) if side else claim_rule.as_good(*errors)
+    if word == UNDECIDED:
+        here += _not_seen(errors, side or -1)
+        if not side:
+            needed = [claim_rule.needed(each, 1 / margin, 90) for each, margin in errors]
+            here += f" That they are no larger: {' and '.join(needed)}."
+    return Found(word, here)
+
+
 def compared(
     at_hand: Tables,
     side: int,
     table: str,
     method: str,
     other: str = "baseline",
+    errors: Iterable[str] = tuple(DECIDING),
     beside: tuple[str, str, str] | None = None,
 ) -> Found:
-    """A claim that both errors that decide are lower (side -1) or higher than another method's.
+    """A claim on errors with a method, over those with another one, as `judged` takes it.
 
     beside: another pair, which stands beside, and what it is.
     """
-    errors = [
-        (at_hand.over(table, method, other, name), error.margin)
-        for name, error in ERRORS.items()
-        if error.decides
-    ]
-    word = claim_rule.on_side(side, *errors)
-    here = _told(at_hand, table, method, other)
+    measured = [(at_hand.over(table, method, other, error), MARGINS[error]) for error in errors]
+    here = _told(at_hand, table, method, other, errors)
     if beside:
-        here += f" {beside[2]}: {_told(at_hand, table, *beside[:2])}"
-    return Found(word, here + (_not_seen(errors, side) if word == UNDECIDED else ""))
+        here += f" {beside[2]}: {_told(at_hand, table, *beside[:2], errors)}"
+    return judged(side, measured, here)
 
 
-def harmless(at_hand: Tables, table: str, method: str, other: str = "baseline") -> Found:
-    """A claim that both errors that decide are no larger than another method's."""
-    errors = [
-        (at_hand.over(table, method, other, name), error.margin)
-        for name, error in ERRORS.items()
-        if error.decides
-    ]
-    word, here = claim_rule.as_good(*errors), _told(at_hand, table, method, other)
-    if word == UNDECIDED:
-        needed = [claim_rule.needed(each, 1 / margin, 90) for each, margin in errors]
-        here += _not_seen(errors, -1) + f" That they are no larger: {' and '.join(needed)}."
-    return Found(word, here)
-
-
-def of_one(at_hand: Tables, side: int, error: str, table: str, method: str) -> Found:
-    """A claim on one error of steps, over that with all keypoints."""
-    of_sequences = at_hand.over(table, method, "baseline", error)
-    margin = ERRORS["rotation"].margin
-    word = claim_rule.on_side(side, (of_sequences, margin))
-    refined = shown(at_hand.over(table, method, "baseline", error, "refined"))
-    here = f"{shown(of_sequences)}; refined estimator {refined}."
-    return Found(
-        word, here + (_not_seen([(of_sequences, margin)], side) if word == UNDECIDED else "")
-    )
-
-
-def _told(at_hand: Tables, table: str, method: str, other: str) -> str:
-    """Return the ratios of both errors that decide as text, of the RMSE, and by both estimators."""
+def _told(at_hand: Tables, table: str, method: str, other: str, errors: Iterable[str]) -> str:
+    """Return the ratios of errors as text, and of the RMSE, and by both estimators."""
     told = []
     for estimator, title in (("thesis", ""), ("refined", "refined estimator: ")):
         try:
-            of_both = [at_hand.over(table, method, other, each, estimator) for each in DECIDING]
+            each = [
+                f"{CALLED[error]} {shown(at_hand.over(table, method, other, error, estimator))}"
+                for error in errors
+            ]
         except NotAtHand:
             continue
-        told.append(f"{title}aligned ATE {shown(of_both[0])}, rotation {shown(of_both[1])}")
+        told.append(title + ", ".join(each))
     if "rmse" in at_hand.table(table):
         told.insert(1, f"RMSE {shown(at_hand.over(table, method, other, 'rmse'))}")
     return "; ".join(told) + "."
@@ -320,7 +312,7 @@ def _not_seen(errors: list[claim_rule.Error], side: int) -> str:
 
 def as_well(at_hand: Tables) -> Found:
     """Masks do as well as all keypoints, at the width that was fixed before any run."""
-    found = harmless(at_hand, "runs", "masked")
+    found = compared(at_hand, 0, "runs", "masked")
     best = at_hand.over("runs", "best width", "baseline", "rmse")
     runs, every = at_hand.rows("runs", "best width"), at_hand.rows("runs", "baseline")
     once = ratios.ratios_of(runs.query("repetition == 0"), every.query("repetition == 0"), "rmse")
@@ -425,16 +417,16 @@ def other_each_time(at_hand: Tables) -> Found:
 def found_again(at_hand: Tables) -> Found:
     """Keypoints on masks are found again more often than as many others."""
     shares = lost(at_hand)
-    of_sequences = shares["mask"] / shares["strongest"]
-    word = claim_rule.on_side(-1, (of_sequences, MARGIN))
     ends = {
-        name: f"{shares[name].min():.0f} to {shares[name].max():.0f} %" for name in ("mask", "all")
+        name: f"{of_one.min():.0f} to {of_one.max():.0f} %"
+        for name, of_one in shares.groupby(level=0)
     }
-    return Found(
-        word,
+    of_sequences = shares["mask"] / shares["strongest"]
+    here = (
         f"Not found in the next frame: {ends['mask']} on masks, {ends['all']} of all; over as many of "
-        f"the strongest {shown(of_sequences)}, over all {shown(shares['mask'] / shares['all'])}.",
+        f"the strongest {shown(of_sequences)}, over all {shown(shares['mask'] / shares['all'])}."
     )
+    return judged(-1, [(of_sequences, MARGIN)], here)
 
 
 def tenth_lost(at_hand: Tables) -> Found:
@@ -459,35 +451,32 @@ def of_widths(at_hand: Tables) -> dict[int, pd.DataFrame]:
     return {threads: rows.droplevel(0) for threads, rows in over_all.groupby(level=0)}
 
 
-def on_each(at_hand: Tables, judge: Callable[[pd.DataFrame], tuple[str, str]]) -> Found:
-    """A claim on times, on one thread and on all. judge: to a word and a text."""
-    judged = {threads: judge(over_all) for threads, over_all in of_widths(at_hand).items()}
-    told = [
-        f"{text} on {threads} thread{'s' if threads > 1 else ''} ({word})"
-        for threads, (word, text) in judged.items()
-    ]
-    return Found(claim_rule.agreed([word for word, _ in judged.values()]), "; ".join(told) + ".")
+def on_each(at_hand: Tables, judge: Callable[[pd.DataFrame], Found]) -> Found:
+    """A claim on times, on one thread and on all. judge: of times over those of all keypoints."""
+    judged_on = {threads: judge(over_all) for threads, over_all in of_widths(at_hand).items()}
+    told = [f"{found.here}, threads: {n} ({found.word})" for n, found in judged_on.items()]
+    return Found(claim_rule.agreed([found.word for found in judged_on.values()]), "; ".join(told))
 
 
-def saved(over_all: pd.DataFrame) -> tuple[str, str]:
+def saved(over_all: pd.DataFrame) -> Found:
     """Widths of 9 to 11 save 5 to 10 % of the time."""
     typical = ratios.typical_ratio(_at_best(over_all))
     value, high, low = (100 * (1 - typical[name]) for name in ("ratio", "low", "high"))
     word = claim_rule.in_range(value, low, high, *SAVED)
     more = _not_told(value, low, high, SAVED, typical["n"]) if word == UNDECIDED else ""
-    return word, f"{value:.0f} % ({low:.0f} to {high:.0f}){more}"
+    return Found(word, f"{value:.0f} % ({low:.0f} to {high:.0f}){more}")
 
 
-def saves(over_all: pd.DataFrame) -> tuple[str, str]:
+def saves(over_all: pd.DataFrame) -> Found:
     """Masks save time."""
     of_sequences = _at_best(over_all)
-    return claim_rule.on_side(-1, (of_sequences, MARGIN)), shown(of_sequences)
+    return judged(-1, [(of_sequences, MARGIN)], shown(of_sequences))
 
 
-def narrow_saves(over_all: pd.DataFrame) -> tuple[str, str]:
+def narrow_saves(over_all: pd.DataFrame) -> Found:
     """The narrowest masks take less time than the widest."""
     of_sequences = over_all[over_all.columns.min()] / over_all[over_all.columns.max()]
-    return claim_rule.on_side(-1, (of_sequences, MARGIN)), shown(of_sequences)
+    return judged(-1, [(of_sequences, MARGIN)], shown(of_sequences))
 
 
 def _at_best(over_all: pd.DataFrame) -> pd.Series:
@@ -500,10 +489,8 @@ def slow_device(at_hand: Tables) -> Found:
     if len(over_all) < 2:
         raise NotAtHand("threads")
     of_sequences = _at_best(over_all[min(over_all)]) / _at_best(over_all[max(over_all)])
-    word = claim_rule.on_side(-1, (of_sequences, MARGIN))
-    here = f"What is left of the time on one thread, over that on {max(over_all)}: {shown(of_sequences)}."
-    more = _not_seen([(of_sequences, MARGIN)], -1) if word == UNDECIDED else ""
-    return Found(word, here + more)
+    what = f"What is left of the time on one thread, over that on {max(over_all)}"
+    return judged(-1, [(of_sequences, MARGIN)], f"{what}: {shown(of_sequences)}.")
 
 
 # Causes
@@ -714,7 +701,7 @@ TESTS: dict[str, Callable[[Tables], Found]] = {
         compared, side=-1, table="few_keypoints_runs", method="random 800", other="all 0"
     ),
     "dense points": partial(
-        harmless, table="few_keypoints_runs", method="random 800", other="all 0"
+        compared, side=0, table="few_keypoints_runs", method="random 800", other="all 0"
     ),
     "frame to frame": other_each_time,
     "a tenth lost": tenth_lost,
@@ -726,7 +713,7 @@ TESTS: dict[str, Callable[[Tables], Found]] = {
     "cause on 01": cause_on_01,
     "sharp turns": partial(sharp_turns, names=LOST_IN_TURNS),
     "returns": partial(returns, names=LOST_IN_TURNS),
-    "turns": lambda at_hand: of_one(at_hand, 1, "in_turns", "runs", "masked"),
+    "turns": partial(compared, side=1, table="runs", method="masked", errors=("in_turns",)),
     "changing boundaries": partial(
         compared,
         side=1,
@@ -751,7 +738,9 @@ TESTS: dict[str, Callable[[Tables], Found]] = {
     "ORB": partial(compared, side=-1, table="ablations", method="orb"),
     "far": partial(compared, side=-1, table="ablations", method="parallax-3"),
     "near": partial(compared, side=-1, table="ablations", method="parallax-20"),
-    "side of the turn": lambda at_hand: of_one(at_hand, -1, "in_turns", "ablations", "turned-into"),
+    "side of the turn": partial(
+        compared, side=-1, table="ablations", method="turned-into", errors=("in_turns",)
+    ),
     "vegetation": partial(compared, side=-1, table="ablations", method="no-vegetation"),
     "static things": partial(compared, side=-1, table="runs", method="static"),
 }
