@@ -123,7 +123,8 @@ def write(settings, folder):
         text = rows.to_csv(index=False, lineterminator="\n", float_format="%.6g")
         write_text(folder / f"{name}.csv", text)
     seconds = timing.folder(settings) / "seconds.csv"
-    write_text(folder / "timings" / "seconds.csv", seconds.read_text(encoding="utf-8"))
+    if seconds.is_file():
+        write_text(folder / "timings" / "seconds.csv", seconds.read_text(encoding="utf-8"))
     equal_number.write(of_runs.__getitem__, folder, note)
     claims.write(folder, note)
     findings = needed(settings.figures / "findings.md", "08_results").read_text(encoding="utf-8")

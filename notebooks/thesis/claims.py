@@ -252,7 +252,7 @@ def judged(side: int, errors: list[claim_rule.Error], here: str) -> Found:
     """
     word = claim_rule.on_side(side, *errors) if side else claim_rule.as_good(*errors)
     if word == UNDECIDED:
-        here += _not_seen(errors, side or -1)
+        here = here.removesuffix(".") + "." + _not_seen(errors, side or -1)
         if not side:
             needed = [claim_rule.needed(each, 1 / margin, 90) for each, margin in errors]
             here += f" That they are no larger: {' and '.join(needed)}."
@@ -454,7 +454,7 @@ def of_widths(at_hand: Tables) -> dict[int, pd.DataFrame]:
 def on_each(at_hand: Tables, judge: Callable[[pd.DataFrame], Found]) -> Found:
     """A claim on times, on one thread and on all. judge: of times over those of all keypoints."""
     judged_on = {threads: judge(over_all) for threads, over_all in of_widths(at_hand).items()}
-    told = [f"{found.here}, threads: {n} ({found.word})" for n, found in judged_on.items()]
+    told = [f"threads {n}: {found.here} ({found.word})" for n, found in judged_on.items()]
     return Found(claim_rule.agreed([found.word for found in judged_on.values()]), "; ".join(told))
 
 
@@ -579,7 +579,7 @@ def longer(at_hand: Tables) -> Found:
     word = claim_rule.grows(means["rmse"], means["frames"])
     here = f"Rank correlation of RMSE and frames: {rank:.2f} on {len(means)} sequences."
     if word == UNDECIDED:
-        reach = (1.96 + 0.84) / np.sqrt(len(means) - 3)
+        reach = (1.96 + 0.84) / np.sqrt(max(len(means) - 3, 1))
         needed = ((1.96 + 0.84) / np.arctanh(0.5)) ** 2 + 3
         here += f" These would have shown {np.tanh(reach):.2f}; for 0.5, {needed:.0f} sequences."
     return Found(word, here)

@@ -63,6 +63,10 @@ def test_evidence_keeps_what_shows_no_frame(executed, tmp_path, monkeypatch):
         "refined_widths",
         "refined_widths_runs",
         "few_keypoints_runs",
+        "found_again",
+        "ends",
+        "equal_number",
+        "claims",
         *evidence.KEPT,
         *evidence.RUNS,
     }
