@@ -210,6 +210,13 @@ def test_opencv_is_called_where_the_lanes_do_not_pay(tmp_path, named, environmen
     assert named in succeed([sys.executable, "-c", code], tmp_path, **environment).stdout
 
 
+@pytest.mark.skipif(not lucas_kanade._has_avx2(), reason="the lanes are for x86 with AVX2")
+@pytest.mark.skipif(cv2.__version__ < "4.14", reason="this OpenCV adds in another order")
+def test_lanes_are_used_where_they_can_be():
+    """Else a mistake in them would be hidden, since OpenCV would be called."""
+    assert reason_for_opencv() == ""
+
+
 def test_opencv_is_called_where_it_adds_in_another_order(monkeypatch):
     real = cv2.calcOpticalFlowPyrLK
 
