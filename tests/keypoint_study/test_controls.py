@@ -100,9 +100,20 @@ def test_a_methods_own_settings_win_over_those_of_a_study(sequence, small_labels
     assert filled.detector == keypoints.filled(methods.FILL, keypoints.spread(200))
 
 
-@pytest.mark.parametrize("group, count", [(methods.ABLATION, 13), (methods.FEW, 6)])
+@pytest.mark.parametrize("group, count", [(methods.ABLATION, 15), (methods.FEW, 6)])
 def test_ablations_and_few_keypoints_are_those_of_the_one_table(group, count):
     assert len(methods.of_group(group)) == count
+
+
+def test_masks_hold_for_five_frames_or_jump_by_as_many_in_each():
+    numbers = np.arange(1000)  # of frames, in place of their masks
+    held, jumping = (
+        np.array([ablations.earlier_mask(numbers, steady, index) for index in numbers])
+        for steady in (True, False)
+    )
+    assert (held == numbers // 5 * 5).all()
+    lags = (numbers - jumping)[4:]
+    assert set(lags) == {0, 1, 2, 3, 4} and lags.mean() == pytest.approx(2, abs=0.15)
 
 
 MADE_FROM = {  # another value of each argument

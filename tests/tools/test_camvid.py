@@ -7,7 +7,8 @@ import tensorflow as tf
 
 import camvid
 from thesis.run_settings import PROFILES
-from thesis_repro.data.cityscapes import N_CLASSES
+from thesis_repro.data import cityscapes
+from thesis_repro.data.cityscapes import ID, N_CLASSES
 from thesis_repro.errors import InputError
 from thesis_repro.segmentation import augmentation, training
 
@@ -56,6 +57,20 @@ def test_it_writes_curves_scores_and_what_the_thesis_reports(tiny_cityscapes, tm
     assert facts.loc["ended by early stopping", "CamVid, seed 0"].startswith("no")
     scores = pd.read_csv(tmp_path / "figures/scores.csv")
     assert len(scores.columns) == 3 and (tmp_path / "figures/figure_4_03.webp").is_file()
+
+
+def test_parts_of_images_and_pixels_are_counted(tiny_cityscapes, tmp_path):
+    camvid.main([str(tiny_cityscapes), f"--figures={tmp_path}", "--areas"])
+    areas = pd.read_csv(tmp_path / "areas.csv", index_col="measure")["mean (%)"]
+    assert {"rim", "inside", "invented 5/15"} <= {*areas.index} and areas.between(0, 100).all()
+    pixels = pd.read_csv(tmp_path / "pixels.csv").iloc[0]
+    pairs = cityscapes.pairs(tiny_cityscapes, "train")
+    labels = np.concatenate([cityscapes.read_label_map(pair.label).ravel() for pair in pairs])
+    over_road = (labels == ID["person"]).sum() / (labels == ID["road"]).sum()
+    assert pixels["persons over road"] == pytest.approx(over_road, abs=1e-4)
+    assert pixels["pixels without a class (%)"] == pytest.approx(
+        100 * (labels == 0).mean(), abs=1e-4
+    )
 
 
 @pytest.mark.torture
