@@ -229,7 +229,7 @@ def table_of_areas(network, pairs, domain):
     """
     from thesis_repro.segmentation import prediction
 
-    images, _ = cityscapes.load(pairs, SIZES.image_size)
+    images, _ = cityscapes.load(pairs, *network.input_shape[2:])
     rows = []
     for pair, predicted in zip(pairs, prediction.predict(network, images), strict=True):
         image = cv2.imread(str(pair.image), cv2.IMREAD_GRAYSCALE)
