@@ -5,7 +5,8 @@ Intervals and their levels are those of `verdicts` and `ratios`. An error matter
 HISTORY, which the page of the claims shows.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -86,6 +87,12 @@ def in_range(value: float, low: float, high: float, least: float, most: float) -
 def at_most(low: float, high: float, limit: float) -> str:
     """Return the word for a number that is said to be no larger than a limit, by its interval."""
     return _word(verdicts.MIN_SEQUENCES, high <= limit, low > limit)
+
+
+def apart(first: Mapping[str, Any], second: Mapping[str, Any]) -> str:
+    """Return the word for a mean that is said to be smaller than another; both have low, high."""
+    is_smaller, is_larger = first["high"] < second["low"], first["low"] > second["high"]
+    return _word(verdicts.MIN_SEQUENCES, is_smaller, is_larger)
 
 
 def against_chance(found: float, by_chance: pd.Series) -> str:

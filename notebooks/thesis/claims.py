@@ -563,10 +563,8 @@ def returns(at_hand: Tables, names: Iterable[str]) -> Found:
 def thin_things(at_hand: Tables) -> Found:
     """Low thresholds are needed to find poles and signs."""
     low, high = (at_hand.measured("87", f"thin {name}") for name in ("5/15", "20/60"))
-    is_apart, is_opposite = low["low"] > high["high"], low["high"] < high["low"]
-    word = REPRODUCED if is_apart else NOT_REPRODUCED if is_opposite else UNDECIDED
     here = f"{low['value']:.0f} % of their boundary pixels have an edge; with 20 and 60, {high['value']:.0f} %."
-    return Found(word, here)
+    return Found(claim_rule.apart(high, low), here)
 
 
 def longer(at_hand: Tables) -> Found:
@@ -621,14 +619,13 @@ def of_areas(at_hand: Tables, worse: str, better: str) -> Found:
     """A measure is lower in one part of images than in another, of the package's network."""
     table = at_hand.of_network("areas").set_index("measure")
     first, second = table.loc[worse], table.loc[better]
-    is_opposite = first["low"] > second["high"]
-    word = NOT_REPRODUCED if is_opposite else UNDECIDED
-    if first["high"] < second["low"]:
-        word = REPRODUCED
     ends = [
         f"{row['mean (%)']:.0f} % ({row['low']:.0f}-{row['high']:.0f})" for row in (first, second)
     ]
-    return Found(word, f"{ends[0]} and {ends[1]}, {first['images']}, the package's network.")
+    return Found(
+        claim_rule.apart(first, second),
+        f"{ends[0]} and {ends[1]}, {first['images']}, the package's network.",
+    )
 
 
 def sky(at_hand: Tables) -> Found:
