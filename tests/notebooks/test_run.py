@@ -62,7 +62,7 @@ def make(settings):
         ("street_world/raster.py", "- 0.5", "- 0.25", ALL),
         ("notebooks/thesis/audit.json", "{", " {", "09"),
         ("notebooks/06_keypoint_masks-Copy1.ipynb", "", "{}", ""),
-        ("notebooks/01_load_images_and_labels.ipynb", "## The data", "## All data", ""),
+        ("notebooks/01_load_images_and_labels.ipynb", "## Classes", "## All classes", ""),
     ],
 )
 def test_what_uses_other_contents_is_executed_again(project, settings, path, old, new, numbers):
