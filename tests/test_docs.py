@@ -4,6 +4,7 @@ import contextlib
 import pydoc
 import re
 import shlex
+import shutil
 import textwrap
 import warnings
 from pathlib import Path
@@ -80,11 +81,17 @@ def test_help_begins_with_an_example_that_runs(small_world, tmp_path, monkeypatc
 def examples(small_world, tmp_path_factory):
     """The Python recipes for what people bring, run beside a world and its frames and video.
 
-    Returns the folder where they ran, the frames, and the names that each leaves.
+    Returns the folder where they ran, the six frames, and the names that each leaves.
     """
     folder = tmp_path_factory.mktemp("examples")
-    (folder / "world").symlink_to(small_world)
-    (folder / "frames").symlink_to(small_world / "kitti/sequences/00/image_0")
+    shutil.copytree(small_world, folder / "world")
+    drive = folder / "world/kitti/sequences/00"
+    for path in sorted(drive.glob("*/*.png")):
+        if int(path.stem) >= 6:
+            path.unlink()
+    for path in (drive / "times.txt", folder / "world/kitti/poses/00.txt"):
+        path.write_text("".join(path.read_text().splitlines(keepends=True)[:6]))
+    (folder / "frames").symlink_to(drive / "image_0")
     images = [cv2.imread(str(path)) for path in sorted((folder / "frames").iterdir())]
     height, width = images[0].shape[:2]
     kind = cv2.VideoWriter_fourcc(*"mp4v")
@@ -106,19 +113,19 @@ def test_the_recipes_for_what_people_bring_run(examples):
     sequence, result = memory["sequence"], memory["result"]
     assert len(sequence) == len(images) == len(result.poses)
     np.testing.assert_allclose(sequence.scales[1:], 8.3 / 25)
-    assert 3 < np.linalg.norm(result.poses[-1, :3, 3]) < 3.7  # eleven steps
+    assert 1.4 < np.linalg.norm(result.poses[-1, :3, 3]) < 1.7  # five steps
     assert np.array_equal(read_poses(folder / "path.txt"), result.poses)
 
     last, mask = network["step"], network["mask_of"](images[-1][..., 0])
     u, v = last.keypoints.astype(int).T
     assert len(u) > 100 and mask[v, u].all()
-    assert 10 < np.linalg.norm(last.pose[:3, 3]) < 11.1  # eleven steps of a metre
+    assert 4.6 < np.linalg.norm(last.pose[:3, 3]) < 5.1  # five steps of a metre
 
     counts = own["result"].frames["detected"]
     plain = own["detect"](images[0][..., 0], None, None)
     assert counts[0] == len(plain) and own["result"].frames["updated"][1:].all()
     truth = tr.Sequence(folder / "world/kitti", 0).poses
-    assert tr.metrics.errors(own["result"].poses, truth)["rmse"] < 0.5  # of eleven steps
+    assert tr.metrics.errors(own["result"].poses, truth)["rmse"] < 0.25  # of five steps
 
     (folder / "camera.txt").write_text("300 300 240 80")
     made = folder / video["folder"]
@@ -126,8 +133,8 @@ def test_the_recipes_for_what_people_bring_run(examples):
     assert len(sequence) == len(images)
     np.testing.assert_allclose(np.diff(sequence.times), 1 / 25, atol=1e-6)
     height, width = sequence.size  # an even number of columns, as the encoder wants
-    expected = images[11][:height, :width, 0].astype(int)
-    assert np.abs(sequence[11] - expected).mean() < 5  # compressed
+    expected = images[5][:height, :width, 0].astype(int)
+    assert np.abs(sequence[5] - expected).mean() < 5  # compressed
 
     camera = read_camera(folder / "sensor.yaml")
     assert camera.matrix[0, 0] == 458.7 and camera.distortion[3] == 0.00002

@@ -180,7 +180,10 @@ def whole():
     return untrained(6)
 
 
-@pytest.mark.parametrize("policy", ["mixed_float16", "mixed_bfloat16", "float16"])
+@pytest.mark.parametrize(
+    "policy",
+    ["mixed_float16", "float16", pytest.param("mixed_bfloat16", marks=pytest.mark.torture)],
+)
 def test_a_network_of_16_bits_computes_in_32(policy, whole, tmp_path):
     keras.config.set_dtype_policy(policy)
     try:
@@ -212,7 +215,8 @@ def test_a_file_of_keras_2_is_refused_and_its_weights_load(tmp_path):
     network.load_weights(old)
     network.save(new)
     loaded = training.load_model(new)
-    assert np.array_equal(prediction.predict(loaded, IMAGES), prediction.predict(written, IMAGES))
+    assert loaded.to_json() == written.to_json()
+    assert all(map(np.array_equal, loaded.get_weights(), written.get_weights()))
     with h5py.File(old, "r+") as file:
         del file.attrs["model_config"]
     with pytest.raises(InputError, match=f"old.hdf5: .*weights alone.*{way_out}"):

@@ -64,10 +64,10 @@ def prepared(sets=SETS, filters=2, rate=0.01, loss=None, falls=0):
     return model, batches, training.Batches([sets[2:]], 4)
 
 
-def fit(folder, epochs=3, patience=5, interrupted=None, **options):
+def fit(folder, epochs=3, patience=5, interrupted=(), **options):
     """Return a function that runs the fit of notebook 4 and returns the history.
 
-    interrupted: the number of batches until Ctrl-C.
+    interrupted: the numbers of batches, counted over all its calls, after which Ctrl-C follows.
     """
     model, batches, validation = prepared(**options)
     stop = keras.callbacks.EarlyStopping(patience=patience)
@@ -77,7 +77,7 @@ def fit(folder, epochs=3, patience=5, interrupted=None, **options):
 
     def end_of_batch(batch, logs):
         seen.append(batch)
-        if len(seen) == interrupted:
+        if len(seen) in interrupted:
             raise KeyboardInterrupt
 
     wait = keras.callbacks.LambdaCallback(on_train_batch_end=end_of_batch)
@@ -89,20 +89,6 @@ def fit(folder, epochs=3, patience=5, interrupted=None, **options):
         return resumable.history
 
     return run
-
-
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("trained")
-    fit(folder, falls=3)()
-    return folder
-
-
-def assert_same(folder, other):
-    """Compare history and best model of two trainings to the bit."""
-    assert (folder / "history.csv").read_text() == (other / "history.csv").read_text()
-    both = [training.load_model(each / MODEL).get_weights() for each in (folder, other)]
-    assert all(map(np.array_equal, *both))
 
 
 def test_threads_are_set_before_tensorflow_computes():
@@ -150,31 +136,33 @@ def test_each_epoch_shows_each_image_once_in_another_order():
     assert seen[0] != seen[1] == seen[2]
 
 
-@pytest.mark.parametrize("at", [2, 12])
-def test_an_interrupted_training_goes_on_in_the_same_kernel(trained, tmp_path, at):
-    run = fit(tmp_path, interrupted=at, falls=3)
-    with pytest.raises(KeyboardInterrupt):
-        run()
+def test_an_interrupted_training_goes_on_in_the_same_kernel(tmp_path):
+    """It ends to the bit as one that was not: history and best model.
+
+    An epoch has five batches: the first call stops in epoch 1, the second in epoch 3.
+    """
+    whole, stopped = tmp_path / "whole", tmp_path / "stopped"
+    fit(whole, falls=3)()
+    run = fit(stopped, interrupted=(2, 14), falls=3)
+    for _ in range(2):
+        with pytest.raises(KeyboardInterrupt):
+            run()
     assert run()["epoch"].tolist() == [1, 2, 3]
-    assert_same(tmp_path, trained)
-
-
-def test_the_record_of_a_model_that_has_learned_is_refused():
-    model, batches, validation = prepared()
-    model.fit(batches.dataset(), verbose=0)
-    with pytest.raises(InputError, match="trained already"):
-        training.made_from(model, batches, validation)
+    assert (stopped / "history.csv").read_text() == (whole / "history.csv").read_text()
+    both = [training.load_model(each / MODEL).get_weights() for each in (whole, stopped)]
+    assert all(map(np.array_equal, *both))
 
 
 def test_early_stopping_keeps_the_best_and_stays_stopped(tmp_path):
     # a validation set that contradicts the training set gets worse as training goes on
     sets = (*SETS[:3], np.where(SETS[3] == 7, 11, 7).astype(np.uint8))
     options = {"sets": sets, "rate": 0.03}
-    losses = fit(tmp_path, 40, patience=2, **options)()["val_loss"]
+    run = fit(tmp_path, 40, patience=2, **options)
+    losses = run()["val_loss"]
     stopped = len(losses)
     assert stopped < 40 and losses.idxmin() == stopped - 3
-    assert len(fit(tmp_path, 40, patience=2, **options)()) == stopped
-    # with more patience, the training resumes
+    assert len(run()) == stopped
+    # with more patience, the training resumes, here with another model, as in another kernel
     assert len(fit(tmp_path, 40, patience=3, **options)()) == stopped + 1
 
 
@@ -241,8 +229,7 @@ def test_one_core_and_all_give_the_same_bits():
     assert one_core.stdout.split()[-1] == digest_of_training()
 
 
-@pytest.mark.parametrize("broken", [0, 1])
-def test_a_training_stops_at_a_loss_that_is_not_finite(tmp_path, broken):
+def test_a_training_stops_at_a_loss_that_is_not_finite(tmp_path):
     model, batches, validation = prepared()
     best = keras.callbacks.ModelCheckpoint(tmp_path / MODEL, save_best_only=True)
     resumable = training.ResumableTraining(tmp_path, batches, [best])
@@ -253,21 +240,19 @@ def test_a_training_stops_at_a_loss_that_is_not_finite(tmp_path, broken):
             kernel.assign(np.full(kernel.shape, np.nan))
 
     callbacks = [best, keras.callbacks.LambdaCallback(on_epoch_begin=break_weights), resumable]
-    with pytest.raises(InputError, match=f"the loss of epoch {broken + 1} is nan"):
-        model.fit(
-            batches.dataset(),
-            validation_data=validation.dataset(),
-            epochs=3,
-            verbose=0,
-            callbacks=callbacks,
-        )
-    assert len(resumable.history) == broken
-    assert (tmp_path / MODEL).exists() == bool(broken)
-    if broken:  # the best network and the checkpoint are those of the first epoch
-        kept = training.load_model(tmp_path / MODEL)
-        callbacks[1:2] = []
-        model.fit(batches.dataset(), epochs=1, verbose=0, callbacks=callbacks)
-        assert all(map(np.array_equal, kept.get_weights(), model.get_weights()))
+    shown = {"validation_data": validation.dataset(), "verbose": 0}
+    for broken in (0, 1):  # the second call begins anew
+        with pytest.raises(InputError, match=f"the loss of epoch {broken + 1} is nan"):
+            model.fit(batches.dataset(), epochs=3, callbacks=callbacks, **shown)
+        assert len(resumable.history) == broken
+        assert (tmp_path / MODEL).exists() == bool(broken)
+    # the best network and the checkpoint are those of the first epoch
+    kept = training.load_model(tmp_path / MODEL)
+    callbacks[1:2] = []
+    model.fit(batches.dataset(), epochs=1, verbose=0, callbacks=callbacks)
+    assert all(map(np.array_equal, kept.get_weights(), model.get_weights()))
+    with pytest.raises(InputError, match="trained already"):
+        training.made_from(model, batches, validation)
 
 
 def test_weights_that_are_not_finite_are_refused(tmp_path):
