@@ -89,11 +89,13 @@ def pytest_collection_finish():
     gc.set_threshold(20_000)
 
 
-@pytest.fixture(autouse=True)
-def short_runs_take_faster_calls(request, monkeypatch):
+@pytest.fixture(autouse=True, scope="module")
+def short_runs_take_faster_calls(request):
     """They have the bits of OpenCV's, as the tests of the odometry show, which take OpenCV's."""
-    if request.path.parent.name != "odometry":
-        monkeypatch.setattr(runs, "FRAMES_TO_LOAD", 1)
+    with pytest.MonkeyPatch.context() as patch:
+        if request.path.parent.name != "odometry":
+            patch.setattr(runs, "FRAMES_TO_LOAD", 1)
+        yield
 
 
 def _real_data(*parts):

@@ -185,6 +185,7 @@ def detect(frame, settings, mask):
 """
 
 
+@pytest.mark.usefixtures("no_figures")
 def test_a_source_that_breaks_later_is_told_once_and_stays_in_the_summary(street, capsys):
     path = street.parent / "own.py"
     path.write_text(BREAKING)
