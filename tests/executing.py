@@ -10,9 +10,12 @@ from thesis.run_settings import PREFIX, ROOT
 
 # what a kernel sees of this process's variables: nothing that the Makefile sets
 KEPT = ("PATH", "HOME", "LANG", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
-# that cells show; those that are saved are as usual
+# that cells show, and that are saved; large ones take a tenth of the time and prove no more
 SMALL_PICTURES = """
 get_config().InlineBackend.print_figure_kwargs = {"bbox_inches": None, "dpi": 40}
+get_config().InteractiveShellApp.exec_lines = [
+    "from keypoint_study.report.style import SETTINGS; SETTINGS['savefig.dpi'] = 40"
+]
 """
 NBCONVERT = [sys.executable, "-m", "nbconvert", "--to=notebook", "--execute"]
 # as in the Makefile
