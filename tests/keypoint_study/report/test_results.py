@@ -22,11 +22,14 @@ NEVER_SHUFFLED = made_up.runs(
 )
 
 
+UNREAD = comparisons.METRIC_TITLES.keys() - {"rmse", "mae", "se3", "rotation"}
+
+
 def runs_of(names, errors, widths=(5, 10, 15), **options):
     methods = {"baseline": [None], "reduced": [None], "masked": widths} | {
         name: [10] for name in CONTROLS
     }
-    return made_up.runs(names, errors, methods, **options)
+    return made_up.runs(names, errors, methods, **options).drop(columns=UNREAD)
 
 
 def widths_of(runs):
@@ -175,7 +178,7 @@ def test_what_is_far_off_is_told_without_it():
         (["00"], 0, ("",)),
         (["00", "05", "06"], 0, ("net", "by hand")),
         (ELEVEN, 0.9, ("",)),
-        (["00", "05"], 0.9, ("",)),
+        pytest.param(["00", "05"], 0.9, ("",), marks=pytest.mark.torture),
     ],
 )
 def test_figures_of_equal_and_of_noisy_errors_can_be_drawn(names, noise, sources):
