@@ -5,8 +5,8 @@ import hashlib
 from thesis_repro import segmentation
 
 
-def digest() -> str:
-    """Return a digest of the weights after two epochs of a small U-Net, and of its predictions."""
+def prepared():
+    """Return a small U-Net, compiled, its batches, and its images."""
     with segmentation.quietly():
         import keras
         import numpy as np
@@ -18,9 +18,15 @@ def digest() -> str:
     labels = random.integers(0, 35, (6, 12, 12), np.uint8).repeat(8, 1).repeat(8, 2)
     keras.utils.set_random_seed(0)
     model = build_unet((96, 96, 1), 35, 4)
-    model.compile(keras.optimizers.Adam(), training.fused_loss(training.total_loss()))
+    loss = training.fused_loss(training.total_loss())
+    model.compile(keras.optimizers.Adam(), loss, metrics=training.metrics())
     model.optimizer.build(model.trainable_variables)  # or TensorFlow compiles the step twice
-    batches = training.Batches([(images, labels)], 3, 0)
-    model.fit(batches.dataset(), epochs=2, shuffle=False, verbose=0)
+    return model, training.Batches([(images, labels)], 3, 0), images
+
+
+def digest(model, batches, images) -> str:
+    """Return a digest of the weights after two epochs, and of the predictions."""
+    shown = {"validation_data": batches.dataset(), "shuffle": False, "verbose": 0}
+    model.fit(batches.dataset(), epochs=2, **shown)
     values = [*model.get_weights(), model.predict(images, verbose=0)]
     return hashlib.sha256(b"".join(value.tobytes() for value in values)).hexdigest()[:12]
