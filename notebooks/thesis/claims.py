@@ -850,6 +850,7 @@ def text_of_claims(claims: list[Claim], note: str) -> str:
 def write(folder: Path, note: str) -> None:
     """Write the page of the claims into a folder in figures, from the tables there."""
 
+    @cache
     def read(name: str) -> pd.DataFrame:
         figures = ROOT / "figures" if name.startswith(CAMVID) else folder.parent
         names = dict.fromkeys(("sequence", "row", "source", "metric", "estimator"), str)

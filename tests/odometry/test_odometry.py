@@ -637,7 +637,7 @@ def counted(monkeypatch, module, name):
 def test_runs_of_one_tracking_share_masks_and_essential_matrices(drive, monkeypatch):
     stripes, few = Stripes(20), Changed(drive, frames=6)
     runs = {
-        (seed, make): (replace(THESIS, shuffle_seed=seed, estimator=make), stripes)
+        (seed, make): (replace(SMALL, shuffle_seed=seed, estimator=make), stripes)
         for seed in (None, 1)
         for make in (None, refined)
     }
@@ -731,14 +731,14 @@ def test_wrong_frames_and_masks_are_named_and_leave_the_state(drive):
 
 
 def test_a_long_run_takes_faster_calls_with_the_same_bits(drive, monkeypatch):
-    expected = odometry.run(drive).frames
-    odometry.run_many(drive, {"": (THESIS, None)})  # compiles them
+    expected = odometry.run(drive, SMALL).frames
+    odometry.run_many(drive, {"": (SMALL, None)})  # compiles them
     searched = counted(monkeypatch, sharing.opencv_exact, "find_essential_matrix")
     monkeypatch.setattr(odometry.runs, "FRAMES_TO_LOAD", len(drive) + 1)
-    odometry.run(drive)
+    odometry.run(drive, SMALL)
     assert not searched
     monkeypatch.setattr(odometry.runs, "FRAMES_TO_LOAD", len(drive))
-    frames = odometry.run(drive).frames
+    frames = odometry.run(drive, SMALL).frames
     assert searched
     numbers = [name for name in frames if not name.endswith("seconds")]
     pd.testing.assert_frame_equal(frames[numbers], expected[numbers], check_exact=True)

@@ -14,6 +14,7 @@ import evidence
 import train_shipped
 from keypoint_study import jobs, runner
 from keypoint_study.sources import Source
+from thesis import claim_rule
 from thesis.run_settings import read_settings
 from thesis_repro.data.sequence import Sequence
 from thesis_repro.segmentation import prediction
@@ -53,6 +54,8 @@ def test_evidence_keeps_what_shows_no_frame(executed, tmp_path, monkeypatch):
     monkeypatch.setattr(evidence.few_keypoints, "TIMED_RUNS", 1)
     monkeypatch.setattr(evidence.few_keypoints, "REPETITIONS", 1)
     monkeypatch.setattr(evidence.few_keypoints, "NUMBERS", (50, 200))
+    monkeypatch.setattr(evidence, "PAIRS", 2)
+    monkeypatch.setattr(claim_rule, "STUDIES", 20)
     evidence.write(settings, out)
     names = {
         "README",
