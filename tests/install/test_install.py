@@ -143,7 +143,9 @@ def test_make_that_only_plans_writes_nothing(checkout):
     "target, options, variables, named",
     [
         ("figures", ["EPOCH=3"], {}, "EPOCH: "),
-        ("figures", [], {"PROFILE": "smal"}, "PROFILE=smal: "),
+        pytest.param(
+            "figures", [], {"PROFILE": "smal"}, "PROFILE=smal: ", marks=pytest.mark.torture
+        ),
         ("figures", ["BUILD=my results"], {}, "BUILD=my results: "),
         ("check-data", [], {"KITTI": "/no/such/folder"}, "/no/such/folder"),
         ("lab", ["PROFILE=labb"], {"CDPATH": "/"}, "PROFILE=labb: "),
