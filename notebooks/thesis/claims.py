@@ -367,9 +367,9 @@ def _not_told(value: float, low: float, high: float, said: list[float], n: int) 
     if least <= value <= most:
         room = min(value - wide[0], wide[1] - value)
     if room <= 0:
-        return " Beside the range, but about: no number of sequences decides this."
+        return " It lies beside the range, but about: no number of sequences decides this."
     reach = max(value - low, high - value)
-    return f", to be decided by {n * (reach / room) ** 2:.0f} sequences"
+    return f" {n * (reach / room) ** 2:.0f} such sequences would decide it."
 
 
 def hundreds(at_hand: Tables) -> Found:
@@ -464,7 +464,7 @@ def saved(over_all: pd.DataFrame) -> Found:
     value, high, low = (100 * (1 - typical[name]) for name in ("ratio", "low", "high"))
     word = claim_rule.in_range(value, low, high, *SAVED)
     more = _not_told(value, low, high, SAVED, typical["n"]) if word == UNDECIDED else ""
-    return Found(word, f"{value:.0f} % ({low:.0f} to {high:.0f}){more}")
+    return Found(word, f"{value:.0f} % ({low:.0f} to {high:.0f}).{more}")
 
 
 def saves(over_all: pd.DataFrame) -> Found:
