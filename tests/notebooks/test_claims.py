@@ -459,6 +459,19 @@ def test_each_row_stands_for_sentences_of_the_thesis():
 # How often each word is said
 
 
+@pytest.mark.parametrize(
+    "value, low, high, told",
+    [
+        (7, 2, 10, " 31 "),  # inside, 3 from the wider range's lower end of 4
+        (2, -4, 6, " 99 "),  # below it by 2
+        (14.5, 10.5, 18.5, " 44 "),  # above its upper end of 12.5 by 2
+        (12, 0, 20, " no number "),  # between both ranges
+    ],
+)
+def test_sequences_that_would_decide_on_a_range(value, low, high, told):
+    assert told in claims._not_told(value, low, high, [5, 10], 11)
+
+
 @pytest.mark.torture
 def test_words_are_said_as_often_as_the_table_says():
     text = (ROOT / "docs/reading-results.md").read_text(encoding="utf-8")
